@@ -38,6 +38,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/install.md", "Install"): "the version of Python",
     ("docs/speed.md", None): "times and ratios of `make bench`",
     ("docs/batches.md", "Many frames of one camera"): "ratios of times, measured once",
+    ("docs/equations.md", "The noise"): "constants of the text",
     ("docs/equations.md", "The common level"): "numbers of equations in a book",
     ("docs/frames.md", "Time and memory"): "times and memory, `python -m tests.benchmarks frames`",
     ("docs/frames.md", "Worlds finer than f"): "experiments against exact solutions, which no command prints",

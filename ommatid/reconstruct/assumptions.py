@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import numpy as np
+
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.model import Model
@@ -40,6 +42,7 @@ from .noise import (
     fitted_noise,
     has_converged,
     has_shared_errors,
+    of_smooth_parts,
     undithered,
     usable_pixels,
 )
@@ -83,7 +86,9 @@ class Assumptions:
         if operators is None:
             return result
         task = method.task
-        columns = common_rounding(self.noise, task.model.light(method.image)[task.used])
+        cosine, sine = common_rounding(self.noise, task.model.light(method.image)[task.used])
+        every = (task.on_all_measurements(each, 0.0) for each in (cosine, sine))
+        columns = np.stack([of_smooth_parts(each, task.model.applied)[task.used] for each in every])
         actual = total_variance(self._independent_noise)
         return with_common_rounding(result, method, operators, columns, truth, actual)
 

@@ -23,6 +23,7 @@ from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.model import Model
+from ommatid.scenes.observation import Observation
 from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
@@ -258,14 +259,22 @@ def common_rounding(noise: Noise, light: FloatArray) -> FloatArray:
 
     noise : by cause, (measurements used,) each;  light : (measurements used,) that the estimate predicts
     """
-    rounding = noise["quantisation"]
-    step = np.sqrt(12 * rounding)
+    step = np.sqrt(12 * noise["quantisation"])
     others = total_variance({name: values for name, values in noise.items() if name != "quantisation"})
     squares = np.zeros(light.size)
     for order in np.pi * np.arange(1, HARMONICS + 1):
         squares += np.exp(-4 * order**2 * others / step**2) / (2 * order**2)
     phase = 2 * np.pi * light / step
     return step * np.sqrt(squares) * np.stack([np.cos(phase), np.sin(phase)])
+
+
+def of_smooth_parts(values: FloatArray, observation: Observation) -> FloatArray:
+    """Return values of measurements, (M,), where all that see a pixel agree, and less where they do not: (M,).
+
+    An image of their means over the measurements that see each pixel is observed again.
+    """
+    seen, total = observation.adjoint(np.ones(values.size)), observation.adjoint(values)
+    return observation.forward(np.divide(total, seen, out=np.zeros_like(seen), where=seen > 0))
 
 
 def at_used(values: FloatArray, used: BoolArray) -> FloatArray:

@@ -3,8 +3,8 @@
 `python -m tests.benchmarks frames` runs one part; the parts are `rendering` and `frames`. No speed is asserted, and
 other load slows both sides of a ratio alike, so compare ratios rather than times. Run by themselves: `chain`, the time,
 memory and files of every stage of a run from 119 x 119 pixels on, and the campaigns, which continue where they were
-interrupted: `nasty`, half an hour, and `coverage`, which measures error bars for hours (`coverage --help`). `cells`
-says in ten minutes which cameras are served.
+interrupted: `nasty`, half an hour, `pictures`, which measures error bars of eleven kinds of picture for two hours, and
+`coverage`, those of rendered scenes for six (`coverage --help`). `cells` says in two minutes which cameras are served.
 """
 
 from __future__ import annotations
@@ -21,10 +21,17 @@ from .chain import command as chain
 from .coverage import command as coverage
 from .frames import frames_table
 from .nasty import command as nasty
+from .pictures import command as pictures
 
 NARROWEST = 160
 PARTS: dict[str, Callable[[], Table]] = {"rendering": camera_table, "frames": frames_table}
-ALONE: dict[str, Callable[[list[str]], None]] = {"cells": cells, "chain": chain, "coverage": coverage, "nasty": nasty}
+ALONE: dict[str, Callable[[list[str]], None]] = {
+    "cells": cells,
+    "chain": chain,
+    "coverage": coverage,
+    "nasty": nasty,
+    "pictures": pictures,
+}
 
 
 def main() -> None:

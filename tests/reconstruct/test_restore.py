@@ -70,11 +70,11 @@ def test_spurious_information_of_h_is_reported() -> None:
 
 def test_the_parts_of_the_budget_add_up() -> None:
     render = {"variant": "scalar_rgb", "samples": 64}
-    noise = {"variance": 1.0, "bits": 6}
+    noise = {"variance": 4.0, "bits": 6}
     _, _, whole = chain(scene(lenses=THREE, calibration={"samples": 64}, noise=noise, render=render))
     assert sum(whole.budget().values()) == pytest.approx(whole.expected.mse)
     assert all(part > 0 for name, part in whole.budget().items() if name != "detail")
-    assert whole.budget()["quantisation"] == pytest.approx(whole.budget()["noise"] * (256 / 2**6) ** 2 / 12, rel=1e-9)
+    assert whole.budget()["quantisation"] == pytest.approx(whole.budget()["noise"] * (256 / 2**6) ** 2 / 48, rel=1e-9)
     bare = chain(scene(lenses=THREE, calibration={"method": "ideal"}, render=render))[2]
     assert [bare.budget()[name] for name in ("noise", "quantisation", "calibration", "detail")] == [0] * 4
 

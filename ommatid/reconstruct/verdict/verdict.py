@@ -199,6 +199,14 @@ class ErrorCheck:
     pixels_used: int
     left_out: tuple[str, ...]
 
+    @property
+    def most_by_rounding(self) -> float:
+        """Largest ratio of a square to its expectation without a fault.
+
+        Readings rounded without dither scatter by step^2 / 4 in place of step^2 / 12 where all are at one edge.
+        """
+        return 1.0 if self.undithered is None else 1 + 2 * self.rounding_share
+
 
 @dataclass
 class _Findings:
@@ -255,8 +263,7 @@ def _judge_residual(parts: list[ResidualPart], evidence: RunEvidence, check: Err
     if not parts:
         findings.notes.append("chi-squared was not checked: some measurements are expected to have no noise")
         return
-    # Readings that are rounded without dither scatter by step^2 / 4 in place of step^2 / 12 where all are at one edge.
-    whole, beyond = parts[0], excesses(parts, 1.0 if check.undithered is None else 1 + 2 * check.rounding_share)
+    whole, beyond = parts[0], excesses(parts, check.most_by_rounding)
     if check.noise_fitted:
         findings.notes.append("the noise was fitted to this stack, so chi-squared was checked by part only")
     if beyond:
@@ -304,7 +311,7 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
     else:
         words = f"the error, {mse:.4g}, lies {{}} its 99 % interval, {interval.low:.4g} to {interval.high:.4g}"
         significant, uncertain = error_p_value(mse, interval) < SIGNIFICANCE, check.calibration_share > SIZE
-        if mse > (1 + SIZE) * interval.high and significant:
+        if mse > (1 + SIZE) * check.most_by_rounding * interval.high and significant:
             findings.reasons.append(words.format("above") + (UNCERTAIN if uncertain else ""))
         elif mse < (1 - SIZE) * interval.low and significant:
             cause = "rounding, or the noise" if check.undithered is not None else "the noise"

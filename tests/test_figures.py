@@ -66,7 +66,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/time.md", "As many as are needed"): "experiments with the samplers, which no command prints",
     ("docs/trust.md", "The verdict"): "constants of the text",
     ("docs/trust.md", "The held-out check"): "constants of the text",
-    ("docs/trust.md", "Coverage"): "the table of `python -m tests.benchmarks coverage`, six hours",
+    ("docs/coverage.md", None): "tables of `python -m tests.benchmarks pictures` and `coverage`, hours",
     ("docs/trust.md", "Limits of the error bar"): "the table of `python -m tests.benchmarks coverage`, six hours",
     ("docs/troubleshooting.md", "Memory"): "an order of magnitude",
     ("docs/units.md", "Positions of the sub-imagers"): "stated and printed in the Python block before it",
@@ -337,7 +337,7 @@ NOT_OUTPUT = {
     "install.md": ("source .venv/bin/activate", "pip install ."),
     "lenses.md": ("# radius  thickness",),
     "recorded.md": ("ommatid import tile19 mosaic.png", "ommatid calibrate tile19 --points"),
-    "trust.md": ("python -m tests.benchmarks",),
+    "coverage.md": ("python -m tests.benchmarks",),
     "worlds.md": ("offset of the lens",),
 }
 FORMULAS = ("equations.md",)  # pages whose text blocks are all formulas

@@ -190,6 +190,6 @@ def _seconds(method: str, scene: Scene, camera: Camera, exact: bool) -> float:
         return 1.0 + count * (per_pixel if not exact else 2e-6)
     if not correlated and serves(camera):
         return 1.5 + 1.5e-9 * band_work(camera)
-    if correlated and not camera.is_sliding:
+    if correlated and not (camera.is_sliding and camera.tolerance is None):
         return 1.5 + 2.2e-4 * count
     return 1.5 + count * (1.2e-5 if exact else 1.5e-4 + per_pixel / 2)

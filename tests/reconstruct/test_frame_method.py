@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ommatid.reconstruct import restore as restoring
 from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import Execution, Prepared
@@ -170,6 +171,15 @@ def test_other_arrays_have_the_error_bars_of_windows(lenses: Any, detail: int, s
     assert np.abs((frame.estimate - image) / np.sqrt(variance)).max() < 1e-3
     np.testing.assert_allclose(frame.expected.variance, variance, rtol=0.03)
     assert frame.solver.variance_bound < 0.03
+
+
+def test_few_pixels_whose_map_is_rough_are_a_dense_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = wide((23, 23), noise={"variance": 1.0}, prior={"kind": "power"})
+    stack = recorded(scene, drawn((23, 23)), 1.0)
+    model = ideal_model(scene, stack.camera)
+    assert restore(stack, model).solver.method == "frame"
+    monkeypatch.setattr(restoring, "ROUGH", -1.0)
+    assert restore(stack, model).solver.method != "frame"
 
 
 def test_lenses_that_diffract() -> None:

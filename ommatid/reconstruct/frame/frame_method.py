@@ -48,6 +48,7 @@ from .world_map import is_invariant, world_of
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 INVARIANT = "every lens type is shift-invariant except at the edges"
+ELSEWHERE = "the lens types do not see alike everywhere: windows give the error bars"
 WORLD = "the world finer than f is estimated, and f's pixels are its averages"
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
 SIMILAR = 0.1  # relative difference of mean weights up to which a preconditioner serves, which costs a step at most
@@ -71,14 +72,22 @@ class FrameMethod(Method):
     """Estimation of all pixels at once by conjugate gradients."""
 
     def __init__(self, task: EstimationTask, execution: Execution) -> None:
-        """Raises InputError if the camera is not shift-invariant and too large, or a measurement has no noise."""
+        """Raises InputError if a measurement has no noise."""
         super().__init__(task, execution)
-        self._banded = task.finer == 1 and task.prior.kind == "independent" and serves(task.model.camera)
-        self._by_waves = task.finer > 1 or not (self._banded or is_invariant(task))
+        independent, camera = task.prior.kind == "independent", task.model.camera
+        self._banded = task.finer == 1 and independent and serves(camera)
+        invariant = camera.is_sliding if independent else is_invariant(task)
+        self._by_waves = task.finer > 1 or not (self._banded or invariant)
         if not (task.expected_noise > 0).all():
             raise InputError(
                 "estimator.method 'frame' needs noise in every measurement; set estimator.noise_variance above 0"
             )
+
+    @property
+    def _why(self) -> str:
+        if self._banded:
+            return NULL_SPACE
+        return WORLD if self.task.finer > 1 else ELSEWHERE if self._by_waves else INVARIANT
 
     @cached_property
     def system(self) -> FrameSystem:
@@ -143,7 +152,7 @@ class FrameMethod(Method):
         solver = SolverReport(
             way="frame",
             method="frame",
-            why=NULL_SPACE if self._banded else WORLD if task.finer > 1 else INVARIANT,
+            why=self._why,
             condition=solution.condition if isfinite(solution.condition) else None,
             variance_bound=check.worst + (difference or 0.0),
             bound=solution.bound,

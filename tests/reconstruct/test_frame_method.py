@@ -26,11 +26,11 @@ from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, views_as_designed
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.model import Model, fitted_model
-from ommatid.scenes.scene import Scene
+from ommatid.scenes.scene import Scene, with_tables
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from ..frames import FITTED, blurred, drawn, observed, recorded, wide, with_apertures
+from ..frames import FITTED, P0, blurred, drawn, observed, recorded, wide, with_apertures
 
 ROOT = Path(__file__).parents[2]
 SHAPE = (52, 47)
@@ -171,6 +171,23 @@ def test_other_arrays_have_the_error_bars_of_windows(lenses: Any, detail: int, s
     assert np.abs((frame.estimate - image) / np.sqrt(variance)).max() < 1e-3
     np.testing.assert_allclose(frame.expected.variance, variance, rtol=0.03)
     assert frame.solver.variance_bound < 0.03
+
+
+def test_sums_and_intervals_are_those_of_the_dense_problem_where_error_bars_are_small() -> None:
+    """At the accuracy of the scene, 0.01 deviations: a sum is solved for relative to its own variance."""
+    scene = wide(SMALL, noise={"variance": 1e-6}, prior={"variance": 1e-4, "level": "known"})
+    truth = 127.5 + 1e-2 / P0**0.5 * (drawn(SMALL, 6) - 127.5)
+    stack = recorded(scene, truth, 1e-6)
+    model = ideal_model(scene, stack.camera)
+    framed = with_tables(scene, estimator=scene.estimator.model_copy(update={"method": "frame"}))
+    dense, frame = (restore(replace(stack, scene=each), model, truth) for each in (scene, framed))
+    assert frame.solver.method == "frame" != dense.solver.method
+    assert dense.expected.mse < 1e-2
+    for region in (((3, 4), (1, 1)), ((9, 8), (5, 5)), ((0, 0), SMALL)):
+        assert frame.region(*region)[1] == pytest.approx(dense.region(*region)[1], rel=0.01)
+    assert dense.interval is not None
+    assert frame.interval is not None
+    assert frame.interval.variance == pytest.approx(dense.interval.variance, rel=0.35)  # of one random image
 
 
 def test_few_pixels_whose_map_is_rough_are_a_dense_problem(monkeypatch: pytest.MonkeyPatch) -> None:

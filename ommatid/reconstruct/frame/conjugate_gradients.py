@@ -39,6 +39,7 @@ Indices = NDArray[np.intp]
 
 ACCURACY = 0.01  # numerical error, in posterior standard deviations
 MEAN_ACCURACY = 0.01  # of operators for means over the frame, likewise
+SUM_ACCURACY = 5e-3  # of the variance of a weighted sum of pixels, relative
 MAX_STEPS = 600
 MAX_STARTS = 3  # each from the recomputed residual
 SAFETY = 0.5  # of the least eigenvalue of P K, which the Lanczos matrix overestimates
@@ -171,6 +172,23 @@ class FrameSystem:
                 raise NotReachedError(_not_reached(bound, lanczos.count, accuracy))
         return Solution(image, lanczos.count, bound, lanczos.largest / lanczos.least if lanczos.count else 1.0)
 
+    def solve_weights(self, weights: FloatArray, accuracy: float) -> FloatArray:
+        """Return C w of (N,) weights, so accurately that w^T C w is right to SUM_ACCURACY, where rounding allows it.
+
+        A residual r changes w^T C w by (w^T C w r^T C r)^1/2 at most, which is small against it only if r is measured
+        against (w^T C w)^1/2, and that is at least w^T w / (w^T K w)^1/2 (Cauchy-Schwarz).
+
+        accuracy : in posterior standard deviations, at least
+        """
+        energy = float(weights @ self.apply(weights))
+        if not energy > 0:
+            return np.zeros_like(weights)
+        try:
+            least = float(weights @ weights) / energy**0.5
+            return self.solve(weights, min(accuracy, SUM_ACCURACY * least)).image
+        except NotReachedError:
+            return self.solve(weights, accuracy).image
+
     def _iterated(
         self, start: FloatArray, start_residual: FloatArray, accuracy: float, before: _Lanczos, progress: Progress
     ) -> tuple[FloatArray, _Lanczos]:
@@ -230,12 +248,15 @@ def mean_accuracy(task: EstimationTask) -> float:
 
 
 def posterior_operators(
-    system: FrameSystem, task: EstimationTask, posterior: Callable[[FloatArray], FloatArray]
+    system: FrameSystem,
+    task: EstimationTask,
+    posterior: Callable[[FloatArray], FloatArray],
+    of_weights: Callable[[FloatArray], FloatArray] | None = None,
 ) -> PosteriorOperators:
-    """Return A, C and their kin from C, `posterior`."""
+    """Return A, C and their kin from C, `posterior`; of_weights : C of weights of pixels, None: the same."""
     return PosteriorOperators(
         gain=lambda values: posterior(system.right_hand_side(task.on_all_measurements(values, 0.0))),
-        posterior=posterior,
+        posterior=posterior if of_weights is None else of_weights,
         weigh=lambda values: values / task.expected_noise,
         hidden=lambda image: posterior(system.apply_prior_precision(image)),
     )

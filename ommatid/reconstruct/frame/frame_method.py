@@ -137,7 +137,7 @@ class FrameMethod(Method):
 
     def operators(self) -> PosteriorOperators:
         """Return the operators of the estimate, to a mean error of a hundredth of a posterior standard deviation."""
-        return posterior_operators(self.system, self.task, self._solve)
+        return posterior_operators(self.system, self.task, self._solve, self._solve_weights)
 
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
@@ -246,9 +246,13 @@ class FrameMethod(Method):
         """Return C b for a mean over the frame, to a mean error of a hundredth of a posterior standard deviation."""
         return self.system.solve(right, mean_accuracy(self.task)).image
 
+    def _solve_weights(self, weights: FloatArray) -> FloatArray:
+        """Return C w of weights of the unknowns, to an accuracy relative to w^T C w."""
+        return self.system.solve_weights(weights, mean_accuracy(self.task))
+
     def _variance_of_sum(self, weights: FloatArray, actual: FloatArray) -> float:
         """Eq. 5 of w^T f^."""
-        solved = self.system.solve(self.task.of_unknowns(weights), self.task.settings.accuracy).image
+        solved = self.system.solve_weights(self.task.of_unknowns(weights), self.task.settings.accuracy)
         prior_part = float(solved @ self.system.apply_prior_precision(solved))
         return float(np.sum((prior_part, self._noise_part(solved, actual))))
 
@@ -284,10 +288,10 @@ class FrameMethod(Method):
         """Interval of the mean squared error of the true image; that less its prior's mean is `deviation`."""
         task, system, count = self.task, self.system, expected.variance.size
         bias = task.of_f(self._solve(system.apply_prior_precision(deviation)))
-        along = self._noise_part(self._solve(task.of_unknowns(bias)), actual)
+        along = self._noise_part(self._solve_weights(task.of_unknowns(bias)), actual)
         random = probe(Purpose.ERROR_INTERVAL).normal(size=count)
-        gain = self._transposed_gain(self._solve(task.of_unknowns(random)))
-        back = task.of_f(self._solve(system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))))
+        gain = self._transposed_gain(self._solve_weights(task.of_unknowns(random)))
+        back = task.of_f(self._solve_weights(system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))))
         noisy = count * sum(part for name, part in expected.parts.items() if name != DETAIL)  # the world is known
         variance = 4 * along + 2 * float(back @ back) + (map_error * noisy) ** 2
         return interval(float(bias @ bias) + noisy, variance, count)

@@ -157,7 +157,8 @@ def with_fallback(
     """Return work(choice) for the chosen method, or for another where a frame chosen by "auto" does not converge.
 
     That is one dense problem of few pixels, tiles of many. Few pixels are a dense problem, too, where the map of a
-    frame's error bars `is_rough`, and at once behind a sensor with dead or saturated pixels.
+    frame's error bars `is_rough` behind arrays that are not m x m, and at once where sensor pixels are dead or
+    saturated.
     """
     check_noise_fit(stack)
     choice = choose_method(stack.scene, stack.camera, _needs_no_matrix(stack, model))
@@ -167,7 +168,8 @@ def with_fallback(
         choice = replace(choice, method="dense", why="some sensor pixels are dead or saturated")
     try:
         done = work(choice)
-        if not (choice.method == "frame" and replaceable and few and is_rough(done)):
+        other = choice.method == "frame" and not stack.camera.is_sliding
+        if not (other and replaceable and few and is_rough(done)):
             return done
         return work(replace(choice, method="dense", why="the map of the frame's error bars is rough"))
     except NotReachedError as error:

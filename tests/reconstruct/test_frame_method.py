@@ -191,7 +191,7 @@ def test_sums_and_intervals_are_those_of_the_dense_problem_where_error_bars_are_
 
 
 def test_few_pixels_whose_map_is_rough_are_a_dense_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = wide((23, 23), noise={"variance": 1.0}, prior={"kind": "power"})
+    scene = wide((23, 23), ODD_RATIOS, noise={"variance": 1.0}, prior={"kind": "power"})
     stack = recorded(scene, drawn((23, 23)), 1.0)
     model = ideal_model(scene, stack.camera)
     assert restore(stack, model).solver.method == "frame"

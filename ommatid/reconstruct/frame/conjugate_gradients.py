@@ -173,12 +173,12 @@ class FrameSystem:
         return Solution(image, lanczos.count, bound, lanczos.largest / lanczos.least if lanczos.count else 1.0)
 
     def solve_weights(self, weights: FloatArray, accuracy: float) -> FloatArray:
-        """Return C w of (N,) weights, so accurately that w^T C w is right to SUM_ACCURACY, where rounding allows it.
+        """Return C w of (N,) weights, so that w^T C w is right to SUM_ACCURACY where the iteration gets there.
 
         A residual r changes w^T C w by (w^T C w r^T C r)^1/2 at most, which is small against it only if r is measured
         against (w^T C w)^1/2, and that is at least w^T w / (w^T K w)^1/2 (Cauchy-Schwarz).
 
-        accuracy : in posterior standard deviations, at least
+        accuracy : in posterior standard deviations, at least, and all there is where more is out of reach
         """
         energy = float(weights @ self.apply(weights))
         if not energy > 0:

@@ -104,7 +104,7 @@ class PriorTable(Table):
     kind: Literal["independent", "exponential", "power", "fit"] = Field(
         default="independent",
         description="correlation of pixels: none; exp(-distance / length); a power of frequency; fitted to the stack;"
-        " absent: fitted in front of m x m lenses of magnification 1/m, with noise",
+        " absent: fitted in front of a camera with noise",
     )
     mean: float = Field(default=127.5, ge=-LARGEST, le=LARGEST)
     variance: float = Field(default=5461.25, gt=0, le=LARGEST**2, description="of every pixel; fitted by kind fit")

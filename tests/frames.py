@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from ommatid.reconstruct.frame.sliding import SlidingCamera, sliding_camera
+from ommatid.reconstruct.frame.bands import bands_of
+from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
@@ -54,9 +55,14 @@ def observed(camera: Camera) -> Observation:
     return observation
 
 
-def sliding(camera: Camera, weights: tuple[float, ...], prior: float) -> SlidingCamera:
-    """The shift-invariant camera that this one is."""
-    return sliding_camera(observed(camera), camera.types, weights, prior)
+def frame_system(
+    camera: Camera, weights: FloatArray, prior: float | FloatArray = P0, observation: Observation | None = None
+) -> FrameSystem:
+    """K of a frame and its preconditioner; prior : variance of independent pixels, or a spectrum of this shape."""
+    seen, precision = observation or observed(camera), 1 / prior
+    spectrum = np.broadcast_to(prior, camera.shape)
+    bands = bands_of(camera, 1, spectrum, weights, seen)
+    return FrameSystem(seen, weights, precision, bands=bands, types=tuple(camera.type_slices()))
 
 
 def precision(matrix: sparse.csr_array, weights: FloatArray, prior: float) -> FloatArray:

@@ -148,17 +148,11 @@ def method_for(stack: Stack, model: Model) -> Method:
     return with_fallback(stack, model, estimated)
 
 
-def with_fallback(
-    stack: Stack,
-    model: Model,
-    work: Callable[[MethodChoice], Result],
-    is_rough: Callable[[Result], bool] = lambda _: False,
-) -> Result:
+def with_fallback(stack: Stack, model: Model, work: Callable[[MethodChoice], Result]) -> Result:
     """Return work(choice) for the chosen method, or for another where a frame chosen by "auto" does not converge.
 
-    That is one dense problem of few pixels, tiles of many. Few pixels are a dense problem, too, where the map of a
-    frame's error bars `is_rough` behind arrays that are not m x m, and at once where sensor pixels are dead or
-    saturated.
+    That is one dense problem of few pixels, tiles of many. Few pixels are a dense problem at once where sensor pixels
+    are dead or saturated.
     """
     check_noise_fit(stack)
     choice = choose_method(stack.scene, stack.camera, _needs_no_matrix(stack, model))
@@ -167,11 +161,7 @@ def with_fallback(
     if choice.method == "frame" and replaceable and few and not usable_pixels(stack, model).used.all():
         choice = replace(choice, method="dense", why="some sensor pixels are dead or saturated")
     try:
-        done = work(choice)
-        other = choice.method == "frame" and not stack.camera.is_sliding
-        if not (other and replaceable and few and is_rough(done)):
-            return done
-        return work(replace(choice, method="dense", why="the map of the frame's error bars is rough"))
+        return work(choice)
     except NotReachedError as error:
         if not replaceable:
             raise

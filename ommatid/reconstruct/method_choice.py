@@ -14,8 +14,9 @@ from ommatid.scenes.scene import Scene
 from .detail.detailed_model import DetailMethod, detail_memory, has_moments
 from .estimator.estimate import needed_memory
 from .frame.conjugate_gradients import band_width, band_work, leaves_null_space, serves
-from .frame.error_map import window_memory
 from .frame.frame_method import FrameMethod
+from .frame.variance_map import LONG
+from .frame.windows import CORE, LONG_HALO
 from .methods.dense_method import DenseMethod
 from .methods.method import Method
 from .methods.tile_method import TileMethod
@@ -23,6 +24,7 @@ from .misalignment.misaligned_methods import AlignedMethod, RobustMethod
 
 PROGRAM_MEMORY = 300_000_000  # bytes, of the program itself and its libraries
 WORLD_IMAGES = 200  # of a world finer than f, that its solver holds at once; measured at 239 x 239 pixels of f
+MATRICES = 8  # of a small frame or of windows, that are held at once
 MOST_CORRELATED = 500  # pixels of a dense problem of correlated pixels where a frame serves: a second
 TILE_ACCURACY = 0.3  # posterior standard deviations from the exact answer, on average; 0.17 where types see all edges
 
@@ -167,17 +169,12 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
         return PROGRAM_MEMORY + images + entries + 2 * processors() * needed_memory(3 * side, side)
     if camera.has_detail and scene.prior.kind != "independent":
         return PROGRAM_MEMORY + images + entries + 8 * WORLD_IMAGES * camera.world.unknowns
-    longest = max(camera.shape)
-    strips = 8 * 4 * longest * (5 * widest) * (5 * widest * (widest - 1) + widest)
     if not correlated and serves(camera):
         band = 8 * camera.unknowns * band_width(camera)
         return PROGRAM_MEMORY + images + entries + 5 * band  # the factor, a copy, and two matrices per block of lines
-    if exact:
-        strips += 8 * 2 * longest * 81 * widest**2 * (widest - 1)
-        return PROGRAM_MEMORY + images + max(strips, window_memory(camera))
-    normal_matrix = 12 * 3 * (2 * widest + 1) ** 2 * camera.unknowns  # K, stored
-    edges = 2 * 8 * 2 * longest * widest * (40 + 10 * widest) ** 2
-    return PROGRAM_MEMORY + images + entries + strips + normal_matrix + edges
+    side = LONG if leaves_null_space(camera) else CORE + 2 * LONG_HALO  # of small frames or windows
+    cut_out = 0 if camera.is_sliding else 12 * camera.measurements * (widest + 1) ** 2  # H, of which windows are parts
+    return PROGRAM_MEMORY + images + entries + cut_out + 8 * MATRICES * side**4
 
 
 def _seconds(method: str, scene: Scene, camera: Camera, exact: bool) -> float:

@@ -31,7 +31,7 @@ from .noise import Noise, UsablePixels, undithered, uniform
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
 from .prior_fit import PriorFit
 from .verdict.residual import WhitenedResidual, residual_parts
-from .verdict.verdict import ROUGH, ErrorCheck, evidence_of, judge, without_pixels
+from .verdict.verdict import ErrorCheck, evidence_of, judge, without_pixels
 
 CORRECTABLE = 0.35  # share of the error by attenuation, up to which the first order of the noise of H serves
 BEYOND = 0.1  # share of the error by the next order, likewise
@@ -238,12 +238,7 @@ def restore(
     [sensor] is to be fitted.
     """
     execution = Execution(workers, progress, prepared or Prepared(model))
-    return with_fallback(
-        stack,
-        model,
-        lambda choice: _restored(stack, model, truth, choice, execution),
-        lambda done: done.solver.variance_bound > ROUGH,
-    )
+    return with_fallback(stack, model, lambda choice: _restored(stack, model, truth, choice, execution))
 
 
 def _restored(

@@ -84,11 +84,6 @@ class Model:
         """The representation of H that is applied fastest: averages over boxes are faster than a matrix."""
         return self.observation if self.structure is None else self.structure
 
-    @cached_property
-    def alike(self) -> Observation:
-        """H by boxes and kernels, or that of the design in its place where it has them: to precondition with."""
-        return self.structure or designed_observation(self.camera) or self.observation
-
     @property
     def windowed(self) -> Observation:
         """The representation of H that windows are cut out of."""

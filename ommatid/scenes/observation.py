@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 ComplexArray = NDArray[np.complex128]
 EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
-FULL = 0.8  # share of an axis that a part sees from which it counts as one that sees all of it
 
 
 class Seen:
@@ -134,21 +133,6 @@ class ObservationPart(ABC):
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """Return a key that is equal for two windows only if their submatrices are equal."""
 
-    @abstractmethod
-    def information(self) -> FloatArray:
-        """Return the mean of H^T H far from the edges, under the DCT-II: (rows, columns)."""
-
-    @abstractmethod
-    def edge_information(self, axis: int, strip: slice) -> FloatArray:
-        """Return H^T H of a strip along an edge, with its mean along the edge under the DCT-II: (length, depth, depth).
-
-        axis : 0 of a strip of rows, 1 of a strip of columns
-        """
-
-    @abstractmethod
-    def corner_information(self, rows: slice, columns: slice) -> FloatArray:
-        """Return H^T H of a small window at a corner: (its pixels, its pixels)."""
-
 
 @dataclass(frozen=True)
 class Entries(ObservationPart):
@@ -224,20 +208,6 @@ class Entries(ObservationPart):
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """Return a key of the window alone: entries are never the same elsewhere."""
         return rows.start, columns.start
-
-    def information(self) -> FloatArray:
-        """Return the trace of H^T H over the pixels: what is known without a shift-invariant camera."""
-        return np.full(self.grid, float(np.square(self.matrix.data).sum()) / (self.grid[0] * self.grid[1]))
-
-    def edge_information(self, axis: int, strip: slice) -> FloatArray:
-        """Return the same for a strip, so that the edge counts as any other place."""
-        depth, length = strip.stop - strip.start, self.grid[1 - axis]
-        return np.broadcast_to(float(self.information()[0, 0]) * np.eye(depth), (length, depth, depth))
-
-    def corner_information(self, rows: slice, columns: slice) -> FloatArray:
-        """Return the same for a corner."""
-        pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
-        return float(self.information()[0, 0]) * np.eye(pixels)
 
 
 @dataclass(frozen=True)
@@ -354,21 +324,3 @@ def on_window(matrix: sparse.csr_array, width: int, rows: slice, columns: slice)
     indices = ((row - rows.start) * shape[1] + column - columns.start)[inside]
     pointers = np.concatenate([[0], np.cumsum(inside)])[matrix.indptr]
     return sparse.csr_array((matrix.data[inside], indices, pointers), shape=(matrix.shape[0], shape[0] * shape[1]))
-
-
-def cosines(size: int, lags: int) -> FloatArray:
-    """Return the weights of lags 0, 1, ... of an even sequence at the frequencies of the DCT-II: (size, lags)."""
-    weights = 2 * np.cos(np.outer(np.pi * np.arange(size) / size, np.arange(lags)))
-    weights[:, 0] = 1.0
-    return weights
-
-
-def density(starts: IntArray | FloatArray, width: float, size: int) -> float:
-    """Return the number of intervals per pixel of an axis; of an axis that they see in part, the mean over all of it.
-
-    starts : (S,) where intervals of `width` begin
-    """
-    count, extent = len(starts), float(np.max(starts) - np.min(starts))
-    if extent + width < FULL * size or count < 2:
-        return count / size
-    return count / (extent * count / (count - 1))

@@ -61,6 +61,7 @@ def solved(cell: Cell, folder: Path) -> Reconstruction:
 
 
 def test_plans_are_refused_for_memory_alone(tmp_path: Path) -> None:
+    needs("llvm_ad_mono")
     answers = {answer(cell, tmp_path) for cell in covering({**FACTORS, "size": (19, 119, 479)})}
     assert answers <= set(METHODS.values())
 

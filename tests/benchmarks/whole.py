@@ -19,7 +19,7 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..frames import observed
+from ..frames import frame_system, observed
 
 WIDTHS = (3, 5, 4)
 MEAN, VARIANCE, NOISE = 127.5, 5461.25, 1e-2
@@ -51,7 +51,7 @@ class Whole:
     def frame(self) -> FrameSystem:
         """Return the frame's solver without any preparation."""
         weights = np.broadcast_to(1 / NOISE, self.camera.measurements)
-        return FrameSystem(observed(self.camera), weights, 1 / VARIANCE)
+        return frame_system(self.camera, weights, VARIANCE)
 
     def estimate(self, accuracy: float = ACCURACY) -> Solution:
         """Return f^ - f0, computed without preparation."""

@@ -10,10 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy import fft, sparse
 
-from ommatid.reconstruct.frame import world_map
+from ommatid.reconstruct.frame import windows
 from ommatid.reconstruct.frame.bands import Bands, Readings
-from ommatid.reconstruct.frame.variance_map import VarianceMap
-from ommatid.reconstruct.frame.world_map import moments
+from ommatid.reconstruct.frame.variance_map import VarianceMap, moments
 from ommatid.reconstruct.prior import exponential_spectrum, reflecting_root
 from ommatid.scenes.observation import Observation, repetition
 from tests.scenes.test_kernels import CAMERA, random_kernels
@@ -71,6 +70,7 @@ def test_groups_of_waves_invert_the_precision_of_reflected_readings(
 ) -> None:
     bands, covariance, _ = camera
     monkeypatch.setattr(Bands, "_strips", ())
+    monkeypatch.setattr(Bands, "_corners", [])
     image = np.random.default_rng(1).normal(size=bands.spectrum.shape)
     np.testing.assert_allclose(bands.solve(image).ravel(), covariance @ image.ravel(), atol=1e-12)
 
@@ -126,7 +126,7 @@ def test_moments_are_products_with_the_covariance() -> None:
 
 def test_a_window_turns_the_map_of_mean_kernels_into_that_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """One window as large as the image: the mean of the map is then that of the inverted precision."""
-    monkeypatch.setattr(world_map, "WINDOW", max(CAMERA.shape))
+    monkeypatch.setattr(windows, "SIDE", max(CAMERA.shape))
     kernels = [random_kernels(0, index=number) for number in range(len(CAMERA.types))]
     varying, means = (Observation(CAMERA.shape, tuple(parts)) for parts in (kernels, [each.mean for each in kernels]))
     spectrum = exponential_spectrum(CAMERA.shape, 4.0)
@@ -140,11 +140,12 @@ def test_a_window_turns_the_map_of_mean_kernels_into_that_of_all(monkeypatch: py
         shape_of_f=CAMERA.shape,
         finer=1,
         precision_on=lambda _: 1 / spectrum,
+        prior=SimpleNamespace(kind="exponential"),
         model=SimpleNamespace(camera=CAMERA),
         used=np.ones(CAMERA.measurements, dtype=np.bool_),
         among_used=lambda numbers: numbers,
         expected_noise=noise,
     )
-    found = world_map.by_windows(VarianceMap(maps[1], maps[1], maps[1]), task, varying, noise)
+    found = windows.by_windows(VarianceMap(maps[1], maps[1], maps[1]), task, varying, noise)
     assert found.posterior.mean() == pytest.approx(maps[0].mean(), rel=1e-6)
     assert abs(maps[0].mean() / maps[1].mean() - 1) > 0.05

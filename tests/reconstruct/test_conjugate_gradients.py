@@ -14,14 +14,14 @@ from ommatid.scenes.tables.estimation import PriorTable
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import Lenses
-from ..frames import FITTED, P0, blurred, frame_camera, observed, precision, wide
+from ..frames import FITTED, P0, blurred, frame_camera, frame_system, precision, wide
 
 TWO: Lenses = FITTED[:2]
 
 
 def ideal_system(shape: tuple[int, int], weight: float, lenses: Lenses = FITTED) -> FrameSystem:
     camera = frame_camera(shape, lenses)
-    return FrameSystem(observed(camera), np.full(camera.measurements, weight), 1 / P0)
+    return frame_system(camera, np.full(camera.measurements, weight))
 
 
 def largest_error(solution: Solution, expected: FloatArray, covariance: FloatArray) -> float:
@@ -64,7 +64,7 @@ def test_the_bound_holds_for_uneven_h_and_noise(seed: int) -> None:
     rng = np.random.default_rng(seed)
     weights = 10 ** rng.uniform(0, 2, model.measurements)
     weights[rng.choice(model.measurements, 100, replace=False)] = 0.0
-    system = FrameSystem(model.observation, weights, 1 / P0, alike=observed(model.camera))
+    system = frame_system(model.camera, weights, observation=model.observation)
     dense = precision(model.matrix, weights, 1 / P0)
     right = system.right_hand_side(model.forward(rng.normal(0, P0**0.5, model.unknowns)))
     solution = system.solve(right)
@@ -85,7 +85,7 @@ def test_a_prior_that_is_diagonal_under_the_cosine_transform(table: PriorTable) 
     shape = (33, 30)
     camera = frame_camera(shape)
     spectrum = np.asarray(spectrum_of(table, shape, 1.0))
-    system = FrameSystem(observed(camera), np.full(camera.measurements, 100.0), 1 / spectrum)
+    system = frame_system(camera, np.full(camera.measurements, 100.0), spectrum)
     waves = np.kron(*(np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in shape))
     prior = waves.T @ ((1 / spectrum.ravel())[:, None] * waves)
     dense = precision(ideal_matrix(camera), system.weights, 0.0) + prior

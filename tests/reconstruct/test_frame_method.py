@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ommatid.reconstruct import restore as restoring
 from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import Execution, Prepared
@@ -188,15 +187,6 @@ def test_sums_and_intervals_are_those_of_the_dense_problem_where_error_bars_are_
     assert dense.interval is not None
     assert frame.interval is not None
     assert frame.interval.variance == pytest.approx(dense.interval.variance, rel=0.35)  # of one random image
-
-
-def test_few_pixels_whose_map_is_rough_are_a_dense_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = wide((23, 23), ODD_RATIOS, noise={"variance": 1.0}, prior={"kind": "power"})
-    stack = recorded(scene, drawn((23, 23)), 1.0)
-    model = ideal_model(scene, stack.camera)
-    assert restore(stack, model).solver.method == "frame"
-    monkeypatch.setattr(restoring, "ROUGH", -1.0)
-    assert restore(stack, model).solver.method != "frame"
 
 
 def test_lenses_that_diffract() -> None:

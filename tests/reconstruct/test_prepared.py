@@ -11,7 +11,8 @@ import pytest
 from hypothesis import strategies as st
 
 from ommatid.reconstruct.estimator import estimate
-from ommatid.reconstruct.frame.error_map import ErrorMap
+from ommatid.reconstruct.frame import frame_method
+from ommatid.reconstruct.frame.error_map import error_map
 from ommatid.reconstruct.methods import dense_method
 from ommatid.reconstruct.methods.method import SAME_NOISE, Conditions, Prepared, relative_difference
 from ommatid.reconstruct.restore import Reconstruction, restore
@@ -82,7 +83,7 @@ def test_error_bars_and_factorisation_are_computed_once(monkeypatch: pytest.Monk
 
         return counted
 
-    monkeypatch.setattr(ErrorMap, "of", counting("map", ErrorMap.of))
+    monkeypatch.setattr(frame_method, "error_map", counting("map", error_map))
     monkeypatch.setattr(dense_method, "expected_error", counting("bars", dense_method.expected_error))
     monkeypatch.setattr(estimate, "_factorised", counting("factor", getattr(estimate, "_factorised")))  # noqa: B009
     for method in ("frame", "dense"):

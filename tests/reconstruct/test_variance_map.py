@@ -1,30 +1,55 @@
-"""Maps of the posterior variance against dense inverses and against exact solutions for single pixels."""
+"""Maps of the error of every pixel of a frame, against dense inverses and exact solutions for single pixels."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy import fft, linalg, sparse
+from scipy import linalg
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
-from ommatid.reconstruct.frame.error_map import ExactVariances, check_map
-from ommatid.reconstruct.frame.sliding import sliding_camera
-from ommatid.reconstruct.frame.variance_map import (
-    SmallFrames,
-    posterior_variance,
-    sliding_variance_map,
-    small_map,
-)
-from ommatid.reconstruct.frame.window_variances import pixel_numbers, stencil_variances, stored_stencil
+from ommatid.reconstruct.frame.error_map import ExactVariances, check_map, error_map
+from ommatid.reconstruct.frame.swept import swept_maps
+from ommatid.reconstruct.frame.variance_map import frame_map
+from ommatid.reconstruct.frame.windows import by_windows, windows_map
+from ommatid.reconstruct.methods.method import EstimationTask
+from ommatid.reconstruct.prior import reflecting_root
+from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.camera import derive
 from ommatid.scenes.fitted.kernels import KernelFootprints
-from ommatid.scenes.observation import Observation
-from ommatid.simulate.ideal import ideal_matrix
+from ommatid.scenes.scene import Scene
+from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from ..frames import P0, blurred, diffracting, frame_camera, observed, precision, sliding, wide
+from ..frames import P0, blurred, frame_camera, frame_system, observed, precision, wide, with_apertures
 
-STATED = 1e-3  # relative accuracy of the maps
+STATED = 1e-3  # relative accuracy of the maps of independent pixels
+CORRELATED: dict[str, Any] = {"prior": {"kind": "exponential", "variance": 2000.0, "correlation_length": "8 mm"}}
+
+
+def task_of(scene: Scene, noise: FloatArray | float = 1e-2) -> EstimationTask:
+    """The task of a scene whose measurements are not asked for; noise : (M,), or the same of all."""
+    model = ideal_model(scene, derive(scene))
+    count, tables = model.measurements, (scene.prior, scene.estimator, scene.tiles)
+    expected = np.broadcast_to(noise, count).astype(np.float64)
+    return EstimationTask(model, np.zeros(count), np.ones(count, np.bool_), expected, *tables)
+
+
+def system_of(task: EstimationTask) -> FrameSystem:
+    prior = 1 / np.asarray(task.precision_on(task.shape))
+    return frame_system(task.model.camera, 1 / task.expected_noise, prior if prior.ndim else float(prior))
+
+
+def uneven(task: EstimationTask, decades: float) -> FloatArray:
+    """Noise variances from 1e-2 on, over some decades: (M,)."""
+    return 1e-2 * 10 ** np.random.default_rng(0).uniform(0, decades, task.model.measurements)
+
+
+def exact_at(task: EstimationTask, place: tuple[int, int]) -> float:
+    unit = np.zeros(task.shape)
+    unit[place] = 1.0
+    return float(system_of(task).solve(unit.ravel(), 1e-6).image.reshape(task.shape)[place])
 
 
 @pytest.mark.parametrize(
@@ -33,110 +58,122 @@ STATED = 1e-3  # relative accuracy of the maps
 )
 def test_the_map_has_the_stated_accuracy(shape: tuple[int, int], noise: float) -> None:
     """At corners, at edges, near them and in the middle, with and without pixels outside some lens types' field."""
-    camera = frame_camera(shape)
-    variance = posterior_variance(sliding(camera, (1 / noise,) * 3, 1 / P0))
-    system = FrameSystem(observed(camera), np.full(camera.measurements, 1 / noise), 1 / P0)
-    rows, columns = shape
-    for row, column in (
+    task = task_of(wide(shape), noise)
+    found = error_map(task, system_of(task), task.expected_noise)
+    variance, (rows, columns) = found.variances.variance.reshape(shape), shape
+    assert found.check.worst < STATED
+    for place in (
         *((0, 0), (0, 50), (1, 2), (rows - 1, 5), (rows - 2, columns - 3), (4, 60), (rows // 2, columns - 1)),
-        *((17, 40), (19, 19), (20, 55), (22, 24), (rows // 2, columns // 2), (rows // 3, 19), (rows - 21, 33)),
+        *((17, 40), (19, 19), (20, 55), (22, 24), (rows // 2, columns // 2), (rows // 3, 19), (rows - 1, columns - 1)),
     ):
-        unit = np.zeros(camera.unknowns)
-        unit[row * columns + column] = 1.0
-        exact = system.solve(unit, 1e-6).image[row * columns + column]
-        assert variance[row, column] == pytest.approx(exact, rel=STATED), (row, column)
+        assert variance[place] == pytest.approx(exact_at(task, place), rel=5 * STATED), place
 
 
-@pytest.mark.parametrize("actual", [(1e-4, 1e-3, 1e-2), (0.01, 0.01, 0.01)])
-def test_actual_noise_that_differs_from_the_expected_one(actual: tuple[float, float, float]) -> None:
-    """Eq. 5 by finite differences of step 1e-4 against dense matrices, on a frame that strips cover entirely."""
-    camera = frame_camera((38, 35))
-    system = sliding(camera, (100.0,) * 3, 1 / P0)
-    variances = sliding_variance_map(system, actual, posterior_variance)
-    matrix = ideal_matrix(camera)
-    covariance = linalg.inv(precision(matrix, np.full(camera.measurements, 100.0), 1 / P0))
+@pytest.mark.parametrize(
+    ("case", "shape", "decades", "accuracy"),
+    [
+        ("independent", (61, 64), 1.0, 1e-3),
+        ("apertures", (47, 46), 0.0, 5e-3),
+        ("correlated", (59, 59), 0.0, 5e-3),
+        pytest.param("independent", (119, 90), 3.0, 2e-2, marks=pytest.mark.slow),
+        pytest.param("correlated", (119, 119), 2.0, 2e-2, marks=pytest.mark.slow),
+    ],
+)
+def test_every_kind_of_frame_at_single_pixels(
+    case: str, shape: tuple[int, int], decades: float, accuracy: float
+) -> None:
+    """Uneven noise of every measurement by windows; even noise by strips, and by small frames."""
+    scene = wide(shape, **(CORRELATED if case == "correlated" else {}))
+    scene = with_apertures(scene) if case == "apertures" else scene
+    task = task_of(scene)
+    task = replace(task, expected_noise=uneven(task, decades))
+    variance = error_map(task, system_of(task), task.expected_noise).variances.variance.reshape(shape)
+    rows, columns = shape
+    for place in ((0, 0), (rows // 2, columns // 2), (rows - 1, columns // 3), (7, 21), (rows - 13, 2)):
+        assert variance[place] == pytest.approx(exact_at(task, place), rel=accuracy), place
+
+
+@pytest.mark.parametrize("case", ["small frame", "strips", "windows", "sweep"])
+def test_actual_noise_that_differs_from_the_expected_one(case: str) -> None:
+    """All parts of Eq. 5 against dense matrices, on a frame that is covered as a whole."""
+    shape = 28, 25
+    task = task_of(wide(shape, **(CORRELATED if case in ("small frame", "windows") else {})))
+    types = task.model.camera.types
     noise = np.concatenate(
-        [np.full(lens_type.measurements, value) for lens_type, value in zip(camera.types, actual, strict=True)]
+        [np.full(each.measurements, value) for each, value in zip(types, (1e-4, 1e-3, 1e-2), strict=True)]
     )
-    noise_gram = precision(matrix, 1e4 * noise, 0.0)
-    missing = np.square(covariance).sum(axis=1) / P0
-    expected = missing + np.diagonal(covariance @ noise_gram @ covariance)
-    np.testing.assert_allclose(variances.posterior.ravel(), np.diagonal(covariance), rtol=1e-9)
-    np.testing.assert_allclose(variances.missing.ravel(), missing, rtol=2e-4)
-    np.testing.assert_allclose((variances.missing + variances.noisy).ravel(), expected, rtol=2e-4)
+    system, matrix = system_of(task), task.model.to_sparse()
+    assert system.bands is not None
+    if case == "sweep":
+        maps = swept_maps(matrix, system.weights, noise / 1e-2, 1 / P0, shape, 5)
+    else:
+        make = windows_map(task, system.weights, system.bands, noise, 28) if case == "windows" else None
+        found = frame_map(task, system, system.bands, noise, far=False) if make is None else make
+        maps = np.array([found.posterior, found.missing, found.noisy])
+    prior = np.eye(shape[0] * shape[1]) / P0
+    if case in ("small frame", "windows"):
+        root = reflecting_root(np.asarray(1 / np.asarray(task.precision_on(shape))))
+        prior = linalg.inv(root @ root.T)
+    covariance = linalg.inv(precision(matrix, system.weights, 0.0) + prior)
+    gram = precision(matrix, 1e4 * noise, 0.0)
+    expected = covariance, covariance @ prior @ covariance, covariance @ gram @ covariance
+    for part, each in zip(maps, expected, strict=True):
+        np.testing.assert_allclose(part.ravel(), np.diagonal(each), rtol=2e-4)
 
 
-def test_any_h_and_any_noise() -> None:
-    """H with errors and noise over a decade, by one sweep, against the dense inverse."""
+def test_one_sweep_serves_any_h_and_any_noise() -> None:
+    """H with errors and noise over a decade, against the dense inverse."""
     shape = (36, 31)
     model, _ = blurred(wide(shape, (("1/4", [2, 3], "fit"), ("1/3", [3, 3], "fit"))), 0.004)
     weights = 10 ** np.random.default_rng(1).uniform(1, 2, model.measurements)
-    pixels = pixel_numbers(shape, slice(0, shape[0]), slice(0, shape[1]))
-    stencil = stored_stencil(sparse.csc_array(model.matrix), weights, 1 / P0, pixels, model.windowed.reach - 1)
+    found = swept_maps(model.matrix, weights, np.ones(weights.size), 1 / P0, shape, model.windowed.reach)
     dense = precision(model.matrix, weights, 1 / P0)
-    np.testing.assert_allclose(stencil_variances(stencil).ravel(), np.diagonal(linalg.inv(dense)), rtol=1e-8)
+    np.testing.assert_allclose(found[0].ravel(), np.diagonal(linalg.inv(dense)), rtol=1e-8)
 
 
 UNEVEN = np.array([[1.0, 0.04, -0.02, -0.1, 0.02, -0.07]])  # a Legendre polynomial over the field
 
 
-def over_the_field(shape: tuple[int, int]) -> Observation:
-    """H of thin lenses which diffract; behind one type the light varies over the field."""
-    observation = observed(diffracting(shape))
+def test_kernels_that_vary_over_the_field() -> None:
+    """To 1 % of a deviation where the light varies by a quarter, at corners, edges and elsewhere: exact solutions."""
+    shape = 83, 90
+    task = task_of(with_apertures(wide(shape)))
+    observation = observed(task.model.camera)
     parts = [
         replace(part, degree=2, coefficients=UNEVEN, error_coefficients=np.zeros((0, 0, UNEVEN.size)))
         for part in observation.parts[:1]
         if isinstance(part, KernelFootprints)
     ]
-    return replace(observation, parts=(*parts, *observation.parts[1:]))
-
-
-@pytest.mark.parametrize("correlated", [False, True])
-def test_a_small_frame_is_the_dense_answer(correlated: bool) -> None:
-    """All parts of Eq. 5, of kernels that vary over the field and of actual noise that differs by lens type."""
-    observation, ratios = over_the_field((21, 18)), (1.0, 0.5, 3.0)
-    spectrum = 1e4 / (1 + np.add.outer(np.arange(21), np.arange(18)) ** 2.0)
-    system = sliding_camera(
-        observation, diffracting((21, 18)).types, (30.0, 20.0, 10.0), 1 / spectrum if correlated else 1 / P0
-    )
-    matrices = [part.to_sparse().toarray() for part in observation.parts]
-    waves = np.kron(*(fft.dct(np.eye(size), norm="ortho", axis=0) for size in (21, 18)))
-    prior = waves.T @ np.diag(1 / spectrum.ravel()) @ waves if correlated else np.eye(378) / P0
-    grams = [each.T @ each for each in matrices]
-    weighed = [weight * each for weight, each in zip(system.weights, grams, strict=True)]
-    covariance = linalg.inv(prior + 0.7 * sum(weighed))
-    noise = 0.7 * sum(ratio * each for ratio, each in zip(ratios, weighed, strict=True))
-    expected = [covariance, covariance @ prior @ covariance, covariance @ noise @ covariance]
-    for found, each in zip(small_map(system, 0.7, ratios), expected, strict=True):
-        np.testing.assert_allclose(found.ravel(), np.diagonal(each), rtol=1e-8)
-
-
-def test_kernels_that_vary_over_the_field() -> None:
-    """To 0.5 % of a deviation where the light varies by a quarter, at corners, edges and elsewhere: exact solutions."""
-    shape = 83, 90
-    observation = over_the_field(shape)
-    system = sliding_camera(observation, diffracting(shape).types, (100.0,) * 3, 1 / P0)
-    frames = SmallFrames(system, lambda _: 1 / P0, (1.0,) * 3, far=False)
-    variance = (frames.relative(1.0) * frames.interior(1.0))[0]
-    exact = FrameSystem(observation, np.full(observation.measurements, 100.0), 1 / P0)
+    observation = replace(observation, parts=(*parts, *observation.parts[1:]))
+    system = replace(system_of(task), observation=observation)
+    assert system.bands is not None
+    maps = frame_map(task, system, system.bands, task.expected_noise, far=False)
+    variance = by_windows(maps, task, observation, task.expected_noise).posterior
     for place in ((0, 0), (41, 44), (41, 0), (82, 30), (20, 60), (60, 89), (5, 70), (70, 12)):
         unit = np.zeros(shape)
         unit[place] = 1.0
-        solved = exact.solve(unit.ravel(), 1e-6).image.reshape(shape)
-        assert variance[place] == pytest.approx(solved[place], rel=0.01), place
+        solved = system.solve(unit.ravel(), 1e-6).image.reshape(shape)
+        assert variance[place] == pytest.approx(solved[place], rel=0.02), place
 
 
-def test_a_map_without_variances_is_no_map() -> None:
-    """A pixel whose variance is 0, infinite or NaN: random pixels may miss it, the verdict does not."""
-    shape = 24, 21
-    camera = diffracting(shape)
-    system = FrameSystem(observed(camera), np.full(camera.measurements, 100.0), 1 / P0)
-    frames = SmallFrames(
-        sliding_camera(system.observation, camera.types, (100.0,) * 3, 1 / P0), lambda _: 1 / P0, (1.0,) * 3, far=False
-    )
-    variance = (frames.relative(1.0) * frames.interior(1.0))[0].ravel()
-    exact = ExactVariances(system, None, 1e-4)
-    assert check_map(variance, variance, shape, exact, local=True).worst < 0.01
-    for wrong in (0.0, -np.inf, np.nan):
-        changed = np.where(np.arange(variance.size) == 200, wrong, variance)
-        assert check_map(changed, variance, shape, exact, local=True).worst >= 1.0
+@pytest.mark.parametrize("as_expected", [pytest.param(True, marks=pytest.mark.slow), False])
+def test_one_solution_measures_the_variances_of_distant_pixels(as_expected: bool) -> None:
+    """Against the dense Eq. 5, and a map that is 5 % off, or is none at a pixel that the check misses, is found."""
+    shape = 47, 41
+    task = task_of(wide(shape))
+    expected = uneven(task, 1)
+    actual = expected if as_expected else expected[::-1].copy()
+    weights, matrix = 1 / expected, ideal_matrix(task.model.camera)
+    covariance = linalg.inv(precision(matrix, weights, 1 / P0))
+    gain = covariance @ (matrix.T.toarray() * weights)
+    error = np.square(covariance).sum(axis=1) / P0 + np.square(gain) @ actual
+    system = frame_system(frame_camera(shape), weights)
+    exact = ExactVariances(system, None if as_expected else weights**2 * actual, 0.01)
+    posterior = np.ascontiguousarray(np.diagonal(covariance))
+    assert check_map(error, posterior, shape, exact, local=True).worst < 2e-3
+    wrong = check_map(1.05 * error, posterior, shape, exact, local=True)
+    assert wrong.worst == pytest.approx(0.05, abs=3e-3)
+    assert wrong.mean == pytest.approx(0.05, abs=3e-3)
+    for none in (0.0, -np.inf, np.nan):
+        changed = np.where(np.arange(error.size) == 200, none, error)
+        assert check_map(changed, posterior, shape, exact, local=True).worst >= 1.0

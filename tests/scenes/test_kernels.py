@@ -10,9 +10,8 @@ import pytest
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, read_kernels, terms
 from ommatid.scenes.observation import Observation
-from ommatid.scenes.optics.boxes import designed_box
 from ommatid.simulate.ideal import ideal_matrix
-from tests.examples import THREE, camera, with_optics
+from tests.examples import camera, with_optics
 from tests.frames import observed
 
 CAMERA = camera()
@@ -108,26 +107,6 @@ def test_every_kernel_of_the_mean_camera_is_the_mean_of_all() -> None:
     np.testing.assert_allclose(total, part.mean_kernel, atol=1e-14)
     assert part.variation == pytest.approx((squares / np.square(part.mean_kernel).sum()) ** 0.5, rel=1e-12)
     assert part.mean.variation == 0
-
-
-@pytest.mark.parametrize("margin", [0, 3])
-def test_information_of_a_box_as_a_kernel(margin: int) -> None:
-    """Far from the edges and in strips along them, by the cosine transform of kernels and of intervals."""
-    frame = camera((40, 44), tuple((magnification, array, "fit") for magnification, array, _ in THREE))
-    for lens_type in frame.types:
-        size = int(lens_type.ratio)
-        kernel = np.pad(np.full((size, size), float(size) ** -2), margin)[None]
-        part = KernelFootprints(
-            KernelPlaces(frame, lens_type, margin), 0, KernelShapes.dense(kernel), np.ones((1, 1)), np.zeros((0, 0, 1))
-        )
-        box = designed_box(frame.shape, lens_type)
-        np.testing.assert_allclose(part.information(), box.information(), atol=1e-12)
-        corner = slice(0, 6), slice(38, 44)
-        np.testing.assert_allclose(part.corner_information(*corner), box.corner_information(*corner), atol=1e-12)
-        for axis, strip in ((0, slice(0, 6)), (0, slice(34, 40)), (1, slice(0, 6)), (1, slice(38, 44))):
-            np.testing.assert_allclose(
-                part.edge_information(axis, strip), box.edge_information(axis, strip), atol=1e-12
-            )
 
 
 FINE = {

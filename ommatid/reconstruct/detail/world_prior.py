@@ -95,3 +95,11 @@ def averaging(shape: tuple[int, int], detail: int) -> sparse.csr_array:
 def repetition(shape: tuple[int, int], detail: int) -> sparse.csr_array:
     """Return the world made of f's pixels, each repeated detail x detail times: (pixels of the world, N)."""
     return sparse.csr_array(averaging(shape, detail).T * float(detail**2))
+
+
+def world_of(image: FloatArray, spectrum: FloatArray, detail: int) -> FloatArray:
+    """Return the likeliest world less its mean, P A^T (A P A^T)^-1 f, of an image, (rows, columns), less its mean."""
+    waves = np.asarray(fft.dctn(image, 2, norm="ortho")) / averaged_spectrum(spectrum, detail)
+    averages = np.kron(np.asarray(fft.idctn(waves, 2, norm="ortho")), np.full((detail, detail), detail**-2.0))
+    spread = np.asarray(fft.dctn(averages, 2, norm="ortho")) * spectrum
+    return np.asarray(fft.idctn(spread, 2, norm="ortho")).ravel()

@@ -1,15 +1,26 @@
-"""A shift-invariant camera in front of a world finer than f, by groups of waves that its readings cannot tell apart.
+"""A shift-invariant camera in front of a world, by groups of waves that its readings cannot tell apart.
 
-The world w has F x F pixels in each pixel of f, and reflecting edges, so that its prior P is diagonal in the cosine
-waves of the world. Readings one pixel of f apart that continue beyond the edges, where they see the world reflected,
-map the waves of frequencies k, 2n - k, 2n + k, 4n - k, ... along an axis (n pixels of f) to one and the same wave of
-readings. In such a group of at most F x F waves a lens type is one row b_t, its transfer function with the signs of
-the aliases, and with the weights w_t = 1 / Rv
+The world w has F x F pixels in each pixel of f (F is 1 where it is no finer), and reflecting edges, so that its prior
+P is diagonal in the cosine waves of the world. Readings one pixel of f apart that continue beyond the edges, where they
+see the world reflected, map the waves of frequencies k, 2n - k, 2n + k, 4n - k, ... along an axis (n pixels of f) to
+one and the same wave of readings. In such a group of at most F x F waves a lens type is one row b_t, its transfer
+function with the signs of the aliases, and with the weights w_t = 1 / Rv
 
     K = P^-1 + sum over types of w_t b_t b_t^T,   K^-1 = P - P B (W^-1 + B^T P B)^-1 B^T P,
 
 where the matrix to be inverted has as many rows as there are lens types. Pixels of f are averages of w: one more row a,
 so that a^T K^-1 a, averaged over the groups, is the variance of a pixel of f far from the edges.
+
+M is K of the readings that continue beyond the edges, and exceeds that of the camera near them. In a strip along an
+edge both are small matrices for each group of waves along it, so that
+
+    M^-1 + sum over edges of R_e^T (K_e^-1 - M_e^-1) R_e
+         + sum over corners of R_c^T (K_c^-1 - sum over both edges of K_e,c^-1 + M_c^-1) R_c
+
+is nearly the inverse of the camera's K, with K_e and M_e the two on a strip, R_e the choice of its pixels, and alike at
+a corner, where K_e,c is what the strip takes for K there: so every place counts once (an additive Schwarz method;
+Smith, Bjorstad and Gropp 1996). Where noise is uneven, K is about S M S with S the root of the local weight over the
+mean.
 """
 
 from __future__ import annotations
@@ -30,7 +41,8 @@ from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.observation import Observation
 
-DEPTH = 12  # pixels of f of a strip
+DEPTH = 16  # pixels of f of a strip
+CORNER = 32  # pixels of the world along the side of a corner, at most
 LEAST = 1e-12  # of the eigenvalues of a strip's correction, relative to the largest
 
 
@@ -124,33 +136,55 @@ class Bands:
         return np.maximum(values, 0.0), roots[:, None] * vectors
 
     def solve(self, image: FloatArray) -> FloatArray:
-        """Return K^-1 r of the camera whose readings continue beyond the edges: (F rows, F columns)."""
+        """Return approximately K^-1 r, (F rows, F columns): symmetric, as conjugate gradients need."""
         scaled = image / self.scale
         waves = np.asarray(fft.dctn(scaled, 2, norm="ortho", workers=processors()))
-        waves *= self.spectrum
+        if self.detail == 1:
+            waves *= self._single
+        else:
+            waves *= self.spectrum
+            self._subtract_seen(waves)
+        solved: FloatArray = np.asarray(fft.idctn(waves, 2, norm="ortho", workers=processors(), overwrite_x=True))
+        for strip in self._strips:
+            strip.add(scaled, solved)
+        for rows, columns, excess in self._corners:
+            near = scaled[rows, columns]
+            solved[rows, columns] += (excess @ near.ravel()).reshape(near.shape)
+        return solved / self.scale
+
+    @cached_property
+    def _single(self) -> FloatArray:
+        """Eigenvalues of M^-1 where each group has one wave: (rows, columns)."""
+        seen = np.zeros(self.shape)
+        for readings, weight in zip(self.types, self.weights, strict=True):
+            seen += weight * np.square(self._row(readings))
+        return self.spectrum / (1 + self.spectrum * seen)
+
+    def _subtract_seen(self, waves: FloatArray) -> None:
+        """Turn the waves of P r into those of M^-1 r in place."""
         seen = np.stack([self._folded(waves * row) for row in self._rows], axis=-1)
         values, vectors = self._spectral
         along = np.einsum("ijtu,ijt->iju", vectors, seen) / (1 + values)
         back = np.einsum("ijtu,iju->ijt", vectors, along)
         for number, row in enumerate(self._rows):
             waves -= self.spectrum * row * self._unfolded(np.ascontiguousarray(back[..., number]))
-        solved: FloatArray = np.asarray(fft.idctn(waves, 2, norm="ortho", workers=processors(), overwrite_x=True))
-        for strip in self._strips:
-            strip.add(scaled, solved)
-        return solved / self.scale
 
     @cached_property
     def _strips(self) -> tuple[Strip, ...]:
         """What lacks at the top, bottom, left and right: K has no readings there that M has."""
-        return tuple(self._strip(axis, last) for axis, last in product((0, 1), (False, True)))
+        return tuple(edge.strip for edge in self._edges.values())
 
-    def _strip(self, axis: int, last: bool) -> Strip:
+    @cached_property
+    def _edges(self) -> dict[tuple[int, bool], _Edge]:
+        """K_e and M_e along axis 0 or 1, at its first or last end."""
+        return {(axis, last): self._edge(axis, last) for axis, last in product((0, 1), (False, True))}
+
+    def _edge(self, axis: int, last: bool) -> _Edge:
         size, detail = self.shape[axis], self.detail
         depth = min(DEPTH, size // 2) * detail
         part = slice(size * detail - depth, size * detail) if last else slice(0, depth)
         members = _members(self.shape[1 - axis], detail)
-        waves = np.asarray(fft.dct(np.eye(size * detail)[:, part], 2, axis=0, norm="ortho"))
-        pairs = (waves[:, :, None] * waves[:, None, :]).reshape(len(waves), -1)
+        pairs = _pairs(size * detail, part)
         precision = 1 / (self.spectrum if axis == 0 else self.spectrum.T)
         priors = (precision.T @ pairs).reshape(-1, depth, depth)[members]
         priors[members < 0] = np.eye(depth)
@@ -165,11 +199,40 @@ class Bands:
                 shares = _shares(readings, axis, size, detail, part, complete=complete)
                 values = np.einsum("pxa,kla->kpxl", shares, along, optimize=True).reshape(len(members), len(shares), -1)
                 total += (weight * values.swapaxes(1, 2) @ values).reshape(total.shape)
-        count = depth * detail
-        excess = np.linalg.inv(seen.reshape(-1, count, count)) - np.linalg.inv(whole.reshape(-1, count, count))
-        values, vectors = np.linalg.eigh((excess + excess.swapaxes(1, 2)) / 2)
-        values = np.where(values > LEAST * values[:, -1:], values, 0.0)
-        return Strip(axis, part, members, (vectors * values[:, None, :]) @ vectors.swapaxes(1, 2))
+        return _Edge(axis, part, members, seen, whole)
+
+    @cached_property
+    def _corners(self) -> list[tuple[slice, slice, FloatArray]]:
+        """Rows and columns of each corner, and what it adds to P there: (pixels, pixels)."""
+        found: list[tuple[slice, slice, FloatArray]] = []
+        for bottom, right in product((False, True), repeat=2):
+            down, across = self._edges[0, bottom], self._edges[1, right]
+            rows, columns = (_ending(edge.part, last) for edge, last in ((down, bottom), (across, right)))
+            along_row, whole = down.on_corner(rows, columns, self.shape[1])
+            along_column = across.on_corner(columns, rows, self.shape[0])[0]
+            tall, wide = rows.stop - rows.start, columns.stop - columns.start
+            turned = along_column.reshape(wide, tall, wide, tall).transpose(1, 0, 3, 2).reshape(whole.shape)
+            exact, first, second, both = (
+                np.linalg.inv(each) for each in (self._on_corner(rows, columns), along_row, turned, whole)
+            )
+            found.append((rows, columns, exact - first - second + both))
+        return found
+
+    def _on_corner(self, rows: slice, columns: slice) -> FloatArray:
+        """Return K of a corner: (its pixels, its pixels)."""
+        tall, wide = rows.stop - rows.start, columns.stop - columns.start
+        down, across = (_pairs(*each) for each in zip(self.spectrum.shape, (rows, columns), strict=True))
+        prior = (down.T @ (1 / self.spectrum) @ across).reshape(tall, tall, wide, wide)
+        total: FloatArray = np.ascontiguousarray(prior.transpose(0, 2, 1, 3)).reshape(tall * wide, tall * wide)
+        for readings, weight in zip(self.types, self.weights, strict=True):
+            shares = [
+                _shares(readings, axis, self.shape[axis], self.detail, part, complete=False)
+                for axis, part in enumerate((rows, columns))
+            ]
+            read = np.einsum("rxa,ab,syb->rsxy", shares[0], readings.even, shares[1], optimize=True)
+            read = read.reshape(-1, tall * wide)
+            total += weight * read.T @ read
+        return total
 
     def _along(self, readings: Readings, axis: int) -> FloatArray:
         """Return the transfer function along an edge of each line of a kernel across it: (waves, lines)."""
@@ -297,6 +360,54 @@ def _shares(readings: Readings, axis: int, size: int, detail: int, part: slice, 
     reading, line = np.nonzero((lines[near] >= part.start) & (lines[near] < part.stop))
     shares[reading, lines[near][reading, line] - part.start, line] = roots[near][reading]
     return shares
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """K_e and M_e of a strip along an edge, by groups of waves along it: (groups, depth, F, depth, F)."""
+
+    axis: int
+    part: slice
+    members: IntArray
+    seen: FloatArray
+    whole: FloatArray
+
+    @property
+    def strip(self) -> Strip:
+        """What the strip adds to P."""
+        count = self.seen.shape[1] * self.seen.shape[2]
+        seen, whole = (np.linalg.inv(each.reshape(-1, count, count)) for each in (self.seen, self.whole))
+        excess = seen - whole
+        values, vectors = np.linalg.eigh((excess + excess.swapaxes(1, 2)) / 2)
+        values = np.where(values > LEAST * values[:, -1:], values, 0.0)
+        return Strip(self.axis, self.part, self.members, (vectors * values[:, None, :]) @ vectors.swapaxes(1, 2))
+
+    def on_corner(self, near: slice, along: slice, size: int) -> tuple[FloatArray, FloatArray]:
+        """Return K_e and M_e of some lines of the strip and a part of its length, numbered by lines: (pixels, pixels).
+
+        size : pixels of f along the edge
+        """
+        lines = slice(near.start - self.part.start, near.stop - self.part.start)
+        detail, pixels = self.members.shape[1], (near.stop - near.start) * (along.stop - along.start)
+        waves = np.asarray(fft.dct(np.eye(size * detail)[:, along], 2, axis=0, norm="ortho"))[self.members]
+        waves[self.members < 0] = 0.0
+        first, second = (
+            np.einsum("kax,kiajb,kby->ixjy", waves, each[:, lines, :, lines], waves, optimize=True)
+            for each in (self.seen, self.whole)
+        )
+        return first.reshape(pixels, pixels), second.reshape(pixels, pixels)
+
+
+def _pairs(size: int, part: slice) -> FloatArray:
+    """Return products of each wave's values at two places of a part: (waves, places squared)."""
+    waves = np.asarray(fft.dct(np.eye(size)[:, part], 2, axis=0, norm="ortho"))
+    return (waves[:, :, None] * waves[:, None, :]).reshape(size, -1)
+
+
+def _ending(part: slice, last: bool) -> slice:
+    """Return the CORNER lines of a strip at its edge."""
+    depth = min(CORNER, part.stop - part.start)
+    return slice(part.stop - depth, part.stop) if last else slice(part.start, part.start + depth)
 
 
 @dataclass(frozen=True)

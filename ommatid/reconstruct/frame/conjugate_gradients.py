@@ -14,7 +14,7 @@ open; conjugate gradients with a preconditioner serve larger ones, and kernels o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil
@@ -25,7 +25,7 @@ from scipy import fft, linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.machine import one_thread
+from ommatid.runtime.machine import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
@@ -33,7 +33,6 @@ from ommatid.scenes.observation import Observation
 
 from ..methods.method import EstimationTask, PosteriorOperators
 from .bands import Bands
-from .reflected import WORKERS, Preconditioner
 
 Indices = NDArray[np.intp]
 
@@ -73,17 +72,17 @@ class FrameSystem:
 
     weights : (M,) 1 / Rv, 0 for sensor pixels that are not used
     prior : 1 / P0 of independent pixels, or 1 / its spectrum, (rows, columns), under the DCT-II
-    alike : boxes and kernels that are like `observation`, for the preconditioner; None: that itself
-    similar : the preconditioner of the same prior and similar weights, None to make one of these
-    bands : the camera like this one in front of a world finer than f, if these are the unknowns
+    bands : the shift-invariant camera like this one, which gives P; None: steps without one
+    types : the measurements of each lens type, over which weights are averaged; none: parts of `observation`
+    similar : P of the same prior and similar weights, None to make one of `bands`
     """
 
     observation: Observation
     weights: FloatArray
     prior: float | FloatArray
-    alike: Observation | None = field(default=None, kw_only=True)
-    similar: Preconditioner | Bands | None = field(default=None, kw_only=True)
     bands: Bands | None = field(default=None, kw_only=True)
+    types: tuple[slice, ...] = field(default=(), kw_only=True)
+    similar: Bands | None = field(default=None, kw_only=True)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -100,37 +99,34 @@ class FrameSystem:
         """Return P0^-1 f: (N,) to (N,)."""
         if isinstance(self.prior, float):
             return self.prior * image
-        waves = fft.dctn(image.reshape(self.shape), 2, norm="ortho", workers=WORKERS)
+        waves = fft.dctn(image.reshape(self.shape), 2, norm="ortho", workers=processors())
         waves *= self.prior
-        return np.asarray(fft.idctn(waves, 2, norm="ortho", workers=WORKERS, overwrite_x=True)).ravel()
+        return np.asarray(fft.idctn(waves, 2, norm="ortho", workers=processors(), overwrite_x=True)).ravel()
 
     def right_hand_side(self, readings: FloatArray) -> FloatArray:
         """Return H^T Rv^-1 g: (M,) to (N,)."""
         return self.observation.adjoint(self.weights * readings)
 
     @cached_property
-    def preconditioner(self) -> Preconditioner | Bands:
-        """P of the mean weights, or scaled by the local ones where noise is uneven: what takes the fewest steps.
-
-        In front of a world finer than f it is that of `bands`, or if H is far from shift-invariant that of `alike`.
-        """
-        if self.similar is not None:
+    def preconditioner(self) -> Bands | None:
+        """P of the mean weights, or scaled by the local ones where noise is uneven: what takes the fewest steps."""
+        if self.similar is not None or self.bands is None:
             return self.similar
-        weights, candidates = self.mean_weights, list[Preconditioner | Bands]()
-        if self.bands is not None:
-            candidates.append(self.bands)
-        if self.bands is None or len(self.observation.parts) != len(self.bands.types):
-            candidates.append(Preconditioner(self._alike, weights, self.prior))
-        pairs = zip(self._alike.slices, weights, strict=True)
+        pairs = zip(self._types, self.mean_weights, strict=True)
         if all(float(np.ptp(self.weights[part])) <= EVEN * weight for part, weight in pairs):
-            return candidates[0] if len(candidates) == 1 else min(candidates, key=self._after_trial)
-        means = np.repeat(weights, [part.stop - part.start for part in self._alike.slices])
-        local, average = self.observation.adjoint(self.weights), self.observation.adjoint(means)
+            return self.bands
+        local, average = self.local_weights
         relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
         scale = np.sqrt(np.maximum(relative, LEAST_LOCAL)).reshape(self.shape)
-        return min([*candidates, *(replace(each, scale=scale) for each in candidates)], key=self._after_trial)
+        return min((self.bands, replace(self.bands, scale=scale)), key=self._after_trial)
 
-    def _after_trial(self, candidate: Preconditioner | Bands) -> float:
+    @cached_property
+    def local_weights(self) -> tuple[FloatArray, FloatArray]:
+        """H^T w of the weights, and of their means over each lens type: (N,) each."""
+        means = np.repeat(self.mean_weights, [part.stop - part.start for part in self._types])
+        return self.observation.adjoint(self.weights), self.observation.adjoint(means)
+
+    def _after_trial(self, candidate: Bands) -> float:
         """Return the bound that a few steps with a preconditioner reach."""
         right = self.apply(probe(Purpose.PRECONDITIONER).normal(size=self.observation.unknowns))
         return replace(self, similar=candidate)._steps(right, TRIAL_STEPS)
@@ -144,13 +140,13 @@ class FrameSystem:
         return np.inf
 
     @property
-    def _alike(self) -> Observation:
-        return self.observation if self.alike is None else self.alike
+    def _types(self) -> Sequence[slice]:
+        return self.types or self.observation.slices
 
     @property
     def mean_weights(self) -> tuple[float, ...]:
-        """Mean weight of each lens type, or of each sub-imager where these are parts of H."""
-        return tuple(float(self.weights[part].mean()) for part in self._alike.slices)
+        """Mean weight of each lens type."""
+        return tuple(float(self.weights[part].mean()) for part in self._types)
 
     def solve(self, right: FloatArray, accuracy: float = ACCURACY, progress: Progress = no_progress) -> Solution:
         """Return C b with an error of at most `accuracy` posterior standard deviations in every pixel.
@@ -232,11 +228,12 @@ class FrameSystem:
         """Upper bound on sqrt(r^T K^-1 r): sqrt(r^T P0 r)."""
         if isinstance(self.prior, float):
             return (float(residual @ residual) / self.prior) ** 0.5
-        waves = np.asarray(fft.dctn(residual.reshape(self.shape), 2, norm="ortho", workers=WORKERS))
+        waves = np.asarray(fft.dctn(residual.reshape(self.shape), 2, norm="ortho", workers=processors()))
         return float(np.sum(np.square(waves) / self.prior)) ** 0.5
 
     def _precondition(self, image: FloatArray) -> FloatArray:
-        return self.preconditioner.solve(image.reshape(self.shape)).ravel()
+        preconditioner = self.preconditioner
+        return image if preconditioner is None else preconditioner.solve(image.reshape(self.shape)).ravel()
 
 
 def mean_accuracy(task: EstimationTask) -> float:

@@ -19,6 +19,7 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.fitted.kernels import KernelFootprints
 
 from ..detail.detailed_model import CAUSE as DETAIL
+from ..detail.world_prior import world_of
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import (
     SAME_NOISE,
@@ -43,8 +44,7 @@ from .conjugate_gradients import (
     posterior_operators,
     serves,
 )
-from .error_map import MANY, ErrorMap, MapCheck, world_error_map
-from .world_map import is_invariant, world_of
+from .error_map import MANY, ErrorMap, error_map, is_invariant
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 INVARIANT = "every lens type is shift-invariant except at the edges"
@@ -60,11 +60,11 @@ DRAWS = 2  # of images and noise for the expected residual
 class FrameError:
     """The expected error of every frame of the same noise.
 
-    check : of the map of variances;  power : expected squares of the residual, `bias` that of an image equal to f0
+    maps : of its variances;  power : expected squares of the residual, `bias` that of an image equal to f0
     """
 
     expected: ExpectedError
-    check: MapCheck
+    maps: ErrorMap
     power: ResidualPower
 
 
@@ -74,10 +74,7 @@ class FrameMethod(Method):
     def __init__(self, task: EstimationTask, execution: Execution) -> None:
         """Raises InputError if a measurement has no noise."""
         super().__init__(task, execution)
-        independent, camera = task.prior.kind == "independent", task.model.camera
-        self._banded = task.finer == 1 and independent and serves(camera)
-        invariant = camera.is_sliding if independent else is_invariant(task)
-        self._by_waves = task.finer > 1 or not (self._banded or invariant)
+        self._banded = task.finer == 1 and task.prior.kind == "independent" and serves(task.model.camera)
         if not (task.expected_noise > 0).all():
             raise InputError(
                 "estimator.method 'frame' needs noise in every measurement; set estimator.noise_variance above 0"
@@ -87,7 +84,7 @@ class FrameMethod(Method):
     def _why(self) -> str:
         if self._banded:
             return NULL_SPACE
-        return WORLD if self.task.finer > 1 else ELSEWHERE if self._by_waves else INVARIANT
+        return WORLD if self.task.finer > 1 else INVARIANT if is_invariant(self.task) else ELSEWHERE
 
     @cached_property
     def system(self) -> FrameSystem:
@@ -101,11 +98,10 @@ class FrameMethod(Method):
         if self._banded:
             banded = BandedSystem(observation, weights, prior, task.model.matrix)
             return self.shared("system", self.conditions(), lambda: banded)[0]
-        bands = None
-        if self._by_waves:
-            spectrum = np.broadcast_to(1 / np.asarray(prior), task.shape)
-            bands = bands_of(task.model.camera, task.finer, spectrum, weights, observation)
-        system = FrameSystem(observation, weights, prior, alike=task.model.alike, bands=bands)
+        spectrum = np.broadcast_to(1 / np.asarray(prior), task.shape)
+        bands = bands_of(task.model.camera, task.finer, spectrum, weights, observation)
+        types = tuple(task.model.camera.type_slices())
+        system = FrameSystem(observation, weights, prior, bands=bands, types=types)
         variances = np.divide(1, system.mean_weights, dtype=np.float64)
         conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
         nearly = _with_mean_kernels(system)
@@ -146,7 +142,7 @@ class FrameMethod(Method):
         make = partial(self._frame_error, noise, actual)
         errors, difference = self.shared(ERRORS, self.conditions(noise), make, SAME_NOISE)
         self.execution.progress(0.9)
-        expected, check = errors.expected, errors.check
+        expected, check = errors.expected, errors.maps.check
         deviation = None if truth is None else self._of_unknowns(truth) - task.prior.mean
         given = None if deviation is None else self._interval(deviation, actual, expected, check.mean)
         solver = SolverReport(
@@ -173,20 +169,16 @@ class FrameMethod(Method):
     def _frame_error(self, noise: dict[str, FloatArray], actual: FloatArray) -> FrameError:
         """Return the expected error, which depends on the noise and not on what is recorded."""
         task, system = self.task, self.system
-        if self._by_waves:
-            variances, check, prior = world_error_map(task, system, actual)
-        else:
-            errors, check = ErrorMap.of(task, system, actual)
-            variances, prior = errors.maps, task.prior.variance
-        variance = np.maximum(variances.missing + variances.noisy, 0.0).ravel()
+        maps = error_map(task, system, actual)
+        variances = maps.variances
         self.execution.progress(0.7)
-        resolved = 1 - variances.posterior.ravel() / prior
+        resolved = 1 - variances.posterior.ravel() / maps.prior
         parts, missing = self._parts(noise, float(variances.noisy.mean())), float(variances.missing.mean())
         if task.finer > 1:
             parts[DETAIL] = min(self._by_detail(), missing)
         self.execution.progress(0.8)
-        expected = ExpectedError(variance, missing - parts.get(DETAIL, 0.0), parts, resolved)
-        return FrameError(expected, check, self._random_power(actual, expected.degrees_of_freedom))
+        expected = ExpectedError(variances.variance, missing - parts.get(DETAIL, 0.0), parts, resolved)
+        return FrameError(expected, maps, self._random_power(actual, expected.degrees_of_freedom))
 
     def _of_unknowns(self, truth: FloatArray) -> FloatArray:
         """Return a true image on the grid of the unknowns; one of f becomes a random world with its averages."""

@@ -1,39 +1,43 @@
-"""Posterior variance of every pixel of a frame without its covariance, of even noise.
+"""The expected error (Eq. 5) of every pixel of a frame whose lens types see the same everywhere.
 
-The interior follows from the transfer function, the border from strips along the edges, of whose inverses only the
-diagonal is computed. In a shift-invariant camera a pixel far from the edges has the mean of 1 / spectrum as its
-variance; near an edge, pixels deeper than some boxes have no effect. If the lens types leave no null space, both are
-accurate to 1e-3 or better; otherwise errors are correlated over any distance and the map is approximate.
+Far from the edges it is that of the transfer functions for the noise of the measurements near a pixel. A small frame
+with the same edges shows how much larger it is near them. Of few pixels the covariances are matrices, and the map is
+exact.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from itertools import pairwise, product
+from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
-from scipy.interpolate import CubicSpline
+from scipy import fft, linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.machine import one_thread, processors
+from ommatid.runtime.machine import processors
 
 from ..forms.cholesky import factorise_positive
-from .sliding import SlidingCamera, SlidingType
-from .window_variances import inverse_diagonal
+from ..methods.method import EstimationTask
+from ..prior import averaged_spectrum, cosine_waves
+from ..problem import is_dense
+from .bands import Bands
+from .conjugate_gradients import FrameSystem, leaves_null_space
+from .swept import swept_maps
 
-FINEST = 1024  # frequencies along an axis; a finer grid makes no difference
-DEPTH = 9  # of a strip, in boxes of the widest type; half of it is used
-STEP = 1e-4  # relative step of a finite difference, and the largest relative error it causes
-SIDE = 40  # pixels of a small frame whose middle represents any interior; the cost grows with the sixth power
+SIDE, FINE_SIDE = 40, 30  # pixels of f of a small frame, and where the world is finer
 LONG, SHORT = 60, 44  # of those from which the effect of the length follows
+GRID = 256  # pixels of f along an axis of the frame without edges
+DEEP = 9  # of a strip along an edge, in kernels; half of it is used
 LEAST_SHARE = 0.1  # of a variance in the small frame, which that in a large one is at least
-GRID = 128  # pixels of the frame without edges on which the effect of kernels is computed
-PLACES = 5  # along each axis, of whose kernels the effect is computed
+COLUMNS = 128  # readings whose covariances are computed at once
+INTERIOR, EDGES = 9, 4  # levels of noise at which the two are computed; others follow from them
+EVEN, EVEN_EDGES = 1e-3, 0.1  # range of levels, logarithms, that count as one
+LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
+
+Maps = Callable[[float], FloatArray]  # from the logarithm of a level to three maps
 
 
 @dataclass(frozen=True)
@@ -44,260 +48,48 @@ class VarianceMap:
     missing: FloatArray
     noisy: FloatArray
 
-
-def variance_map(perturbed: Callable[[float, float], FloatArray], *, noise_as_expected: bool) -> VarianceMap:
-    """Return the map from `perturbed`, the diagonal of (K + s P0^-1 + t S)^-1 for small s and t.
-
-    S is H^T Rv^-1 Rvm Rv^-1 H with the actual noise Rvm, so the terms of Eq. 5, C P0^-1 C + C S C, are derivatives.
-    noise_as_expected : True if Rvm = Rv; the part of the noise is then the rest of C
-    """
-    posterior = perturbed(0.0, 0.0)
-    missing = (posterior - perturbed(STEP, 0.0)) / STEP
-    if noise_as_expected:
-        return VarianceMap(posterior, missing, posterior - missing)
-    return VarianceMap(posterior, missing, (perturbed(0.0, -STEP) - perturbed(0.0, STEP)) / (2 * STEP))
-
-
-def sliding_variance_map(
-    system: SlidingCamera, actual: tuple[float, ...], posterior: Callable[[SlidingCamera], FloatArray]
-) -> VarianceMap:
-    """Return the map of a shift-invariant camera whose lens types have the actual noise variances `actual`."""
-    ratios = [weight * variance for weight, variance in zip(system.weights, actual, strict=True)]
-    largest = max(ratios) or 1.0
-    as_expected = np.allclose(ratios, 1.0, rtol=1e-12)
-
-    def perturbed(prior: float, noise: float) -> FloatArray:
-        changes = [1 + noise * ratio / largest for ratio in ratios]
-        weights = tuple(weight * change for weight, change in zip(system.weights, changes, strict=True))
-        return posterior(replace(system, weights=weights, prior=system.prior * (1 + prior)))
-
-    variances = variance_map(perturbed, noise_as_expected=as_expected)
-    return variances if as_expected else replace(variances, noisy=largest * variances.noisy)
-
-
-def posterior_variance(system: SlidingCamera) -> FloatArray:
-    """Return the diagonal of K^-1 for independent pixels: (rows, columns)."""
-    # Pixels beyond a strip count as known, so at a corner the larger of two variances is the more accurate one.
-    border = np.zeros(system.shape)
-    with one_thread():  # the blocks are small
-        for axis in (1, 0):
-            view = border if axis == 0 else border.T
-            size = system.shape[axis]
-            deep = min(DEPTH * system.widest(axis), size)
-            half = (deep + 1) // 2 if deep < size else size
-            top = _strip_variance(system, axis, slice(0, deep))
-            bottom = _strip_variance(system, axis, slice(size - deep, size))
-            for rows, part in ((slice(0, half), top[:half]), (slice(size - half, size), bottom[deep - half :])):
-                view[rows] = np.maximum(view[rows], part)
-    return np.where(border > 0, border, interior_variance(system))
-
-
-def unseen_corners(system: SlidingCamera) -> list[tuple[int, int]]:
-    """Return the corner pixels, (row, column), where two edges meet that some lens types do not see.
-
-    Errors there reach along both edges to their ends, and no strip shows their variance.
-    """
-    ends = [
-        [
-            place
-            for place, unseen in (
-                (0, any(each.axes[axis].first > 0 for each in system.types)),
-                (size - 1, any(each.axes[axis].end < size for each in system.types)),
-            )
-            if unseen
-        ]
-        for axis, size in enumerate(system.shape)
-    ]
-    return [(row, column) for row in ends[0] for column in ends[1]]
-
-
-def interior_variance(system: SlidingCamera) -> float:
-    """Mean of 1 / spectrum over the frequencies of a frame without edges."""
-    vertical, horizontal = (
-        2 * np.pi * (np.arange(min(size, FINEST)) + 0.5) / min(size, FINEST) for size in system.shape
-    )
-    total = np.full((vertical.size, horizontal.size), system.prior)
-    for means, weight in zip(system.types, system.weights, strict=True):
-        total += weight * np.outer(means.vertical.transfer_at(vertical), means.horizontal.transfer_at(horizontal))
-    return float(np.mean(1 / total))
-
-
-def _strip_variance(system: SlidingCamera, axis: int, part: slice) -> FloatArray:
-    """The diagonal of the inverse of K in a strip along one edge, (depth, length), by blocks of its columns."""
-    prior = float(np.asarray(system.prior))
-    depth, length = part.stop - part.start, system.shape[1 - axis]
-    wide = max(system.widest(1 - axis) - 1, 1)
-    across = [means.axes[axis].gram[part, part].toarray() for means in system.types]
-    along = [weight * means.axes[1 - axis].gram for means, weight in zip(system.types, system.weights, strict=True)]
-    blocks = [slice(first, last) for first, last in pairwise([*range(0, length, wide), length])]
-
-    def block(row: int, column: int) -> FloatArray:
-        parts = [
-            np.kron(gram[blocks[row], blocks[column]].toarray(), other)
-            for gram, other in zip(along, across, strict=True)
-        ]
-        values = np.sum(parts, axis=0)
-        if row == column:
-            values[np.diag_indices_from(values)] += prior
-        return values
-
-    return inverse_diagonal(len(blocks), block).reshape(length, depth).T
+    @property
+    def variance(self) -> FloatArray:
+        """Eq. 5 of all pixels, (N,)."""
+        return np.maximum(self.missing + self.noisy, 0.0).ravel()
 
 
 @dataclass(frozen=True)
-class _Place:
-    """A place on an axis of a frame whose kernels small frames have.
+class Moments:
+    """Prior covariances of f's pixels and the readings: (N,) diagonal, (N, M) of both, (M, M) of the readings."""
 
-    at : from 0, the axis's first end, to 1, its last
-    pixels, share : those of the axis to which it contributes, and how much: (n,)
-    """
+    pixels: FloatArray
+    both: FloatArray
+    readings: FloatArray
 
-    size: int
-    at: float
-    pixels: NDArray[np.intp]
-    share: FloatArray
-
-    def before(self, side: int) -> int:
-        """Return the number of pixels before a small frame."""
-        return round(self.at * (self.size - side))
-
-    def index(self, side: int) -> NDArray[np.intp]:
-        """Return the pixels of a small frame that stand for `pixels`: (n,)."""
-        return _small_index(self.size, side)[self.pixels]
-
-    def kept(self, side: int) -> NDArray[np.intp]:
-        """Return the pixels whose kernels those of a small frame have: (n,)."""
-        return self.before(side) + self.index(side)
+    def variances(self, expected: FloatArray, actual: FloatArray, shape: tuple[int, int]) -> FloatArray:
+        """Return the three maps for readings with these noise variances, (M,): (3, rows, columns)."""
+        covariance = self.readings + np.diag(expected)
+        factor = linalg.cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
+        gain = np.asarray(linalg.cho_solve(factor, self.both.T, check_finite=False)).T
+        posterior = self.pixels - np.einsum("ij,ij->i", gain, self.both)
+        squares = np.square(gain)
+        missing = np.maximum(posterior - squares @ expected, 0.0)
+        return np.array([np.maximum(posterior, 0.0), missing, squares @ actual]).reshape(3, *shape)
 
 
-class SmallFrames:
-    """Small frames with the edges of a large one, whose middle represents any interior, for any prior and any kernels.
-
-    Errors of waves that some lens types do not see reach from edge to edge. Where an edge has as many such waves in a
-    frame of any length n, their part in the variance of a pixel falls with 1 / n, which two lengths show. Maps are
-    relative to the variances that transfer functions give far from the edges, for the kernels at the same place: where
-    kernels vary over the field, small frames have those of nine places, edges and corners among them.
-
-    precision : from a shape to 1 / P0 of independent pixels, or 1 / the spectrum of the prior on that shape
-    ratios : of the actual to the expected noise variance of each lens type
-    far : True if errors reach from edge to edge; kernels are then those of the middle of the frame
-    """
-
-    def __init__(
-        self,
-        system: SlidingCamera,
-        precision: Callable[[tuple[int, int]], float | FloatArray],
-        ratios: tuple[float, ...],
-        *,
-        far: bool,
-    ) -> None:
-        """Take a shift-invariant camera whose weights are the means of each lens type."""
-        self.shape = system.shape
-        self._system, self._ratios, self._precision, self._far = system, ratios, precision, far
-        self._varies = not far and any(each.varies for each in system.types)
-        self._types: dict[tuple[int, tuple[int, ...]], SlidingType] = {}
-
-    def relative(self, scale: float) -> FloatArray:
-        """Return the three maps for all weights times `scale`, relative to those of `interior`: (3, rows, columns)."""
-        total = np.zeros((3, *self.shape))
-        local = self._local(scale)
-        sides = [min(LONG if self._far else SIDE, size) for size in self.shape]
-        every = list(product(*(self._places(size) for size in self.shape)))
-        with ThreadPoolExecutor(processors()) as threads:
-            of_places = list(threads.map(partial(self._at, scale), every))
-        for places, at in zip(every, of_places, strict=True):
-            down, across = places
-            kept = (each.kept(side) for each, side in zip(places, sides, strict=True))
-            maps = at / np.maximum(_interpolated(local, self.shape, *kept), np.finfo(float).tiny)
-            for each, found in zip(total, maps, strict=True):
-                each[np.ix_(down.pixels, across.pixels)] += np.outer(down.share, across.share) * found
-        return total
-
-    def interior(self, scale: float) -> FloatArray:
-        """Return the three maps of a frame without edges for all weights times `scale`: (3, rows, columns)."""
-        return _interpolated(self._local(scale), self.shape, *(np.arange(size) for size in self.shape))
-
-    def _at(self, scale: float, places: tuple[_Place, ...]) -> FloatArray:
-        """Return the three maps of the pixels that belong to a place from the small frames there."""
-        found: list[FloatArray] = []
-        shares: list[float] = []
-        for lengths in product(*(self._lengths(size) for size in self.shape)):
-            sides = tuple(side for side, _ in lengths)
-            down, across = (each.index(side) for each, side in zip(places, sides, strict=True))
-            found.append(self._small(sides, scale, places)[:, down[:, None], across])
-            shares.append(float(np.prod([share for _, share in lengths])))
-        total = sum(share * each for share, each in zip(shares, found, strict=True))
-        return np.maximum(total, LEAST_SHARE * found[0])
-
-    def _lengths(self, size: int) -> list[tuple[int, float]]:
-        """Return the sides of small frames along an axis and their shares in the variances of the large one."""
-        if not self._far or size <= LONG:
-            return [(min(LONG if self._far else SIDE, size), 1.0)]
-        share = (1 / size - 1 / LONG) / (1 / SHORT - 1 / LONG)
-        return [(LONG, 1 - share), (SHORT, share)]
-
-    def _small(self, shape: tuple[int, ...], scale: float, places: tuple[_Place, ...]) -> FloatArray:
-        rows, columns = shape
-        before = places[0].before(rows), places[1].before(columns)
-        types: list[SlidingType] = []
-        for number, each in enumerate(self._system.types):
-            if self._varies and each.varies:
-                types.append(each.shortened((rows, columns), before))
-                continue
-            if (number, shape) not in self._types:  # H^T H is computed once
-                self._types[number, shape] = each.shortened((rows, columns), before)
-            types.append(self._types[number, shape])
-        system = SlidingCamera(tuple(types), self._system.weights, self._precision((rows, columns)))
-        return small_map(system, scale, self._ratios)
-
-    def _places(self, size: int) -> list[_Place]:
-        """Return the places along an axis whose kernels small frames have."""
-        if not self._varies or size <= SIDE:
-            return [_Place(size, 0.5, np.arange(size), np.ones(size))]
-        along = np.clip((np.arange(size) - SIDE / 2) / (size - SIDE), 0, 1)
-        places: list[_Place] = []
-        for at, share in (
-            (0.0, (2 * along - 1) * (along - 1)),
-            (0.5, 4 * along * (1 - along)),
-            (1.0, (2 * along - 1) * along),
-        ):
-            pixels = np.flatnonzero(share)
-            places.append(_Place(size, at, pixels, share[pixels]))
-        return places
-
-    def _local(self, scale: float) -> FloatArray:
-        """Return the three variances far from the edges at places of the frame: (places down, places across, 3)."""
-        return np.array([[self._interior(each, scale) for each in line] for line in self._transfers])
-
-    @cached_property
-    def _transfers(self) -> list[list[FloatArray]]:
-        """Squared transfer functions of the types' kernels at PLACES x PLACES places of the frame, or at its middle."""
-        down, across = (np.linspace(0, size, PLACES) if self._varies else np.array([size / 2]) for size in self.shape)
-        kernels = [zip(*(each.kernels_at(row, across) for each in self._system.types), strict=True) for row in down]
-        return [[np.array([_transfer(kernel) for kernel in each]) for each in line] for line in kernels]
-
-    @cached_property
-    def _prior(self) -> float | FloatArray:
-        return self._precision((GRID, GRID))
-
-    def _interior(self, transfers: FloatArray, scale: float) -> FloatArray:
-        """Return the variances far from the edges by transfer functions, as the maps have them: (3,)."""
-        weights, prior = scale * np.asarray(self._system.weights), self._prior
-        squares = 1 / np.square(prior + np.tensordot(weights, transfers, axes=1))
-        missing = np.mean(prior * squares)
-        noisy = np.mean(np.tensordot(weights * self._ratios, transfers, axes=1) * squares)
-        return np.array([np.mean(np.sqrt(squares)), missing, noisy], dtype=np.float64)
-
-
-def small_map(system: SlidingCamera, scale: float, ratios: tuple[float, ...]) -> FloatArray:
-    """Return the diagonals of C, C P0^-1 C and C S C of a small frame for weights times `scale`: (3, rows, columns)."""
-    parts = [scale * weight * each.information for each, weight in zip(system.types, system.weights, strict=True)]
-    first, excess = ratios[0], None
-    for part, ratio in zip(parts, ratios, strict=True):
-        if not np.isclose(ratio, first, rtol=1e-12):
-            excess = (ratio - first) * part + (0.0 if excess is None else excess)
-    precision = np.sum(parts, axis=0) + prior_precision(system.prior, system.shape)
-    return precision_map(precision, system.prior, system.shape, first, excess)
+def moments(matrix: sparse.csr_array, spectrum: FloatArray, detail: int) -> Moments:
+    """Return the covariances for H, (M, pixels of the world), and the prior's spectrum, (F rows, F columns)."""
+    fine, shape = spectrum.shape, (spectrum.shape[0] // detail, spectrum.shape[1] // detail)
+    count = matrix.shape[0]
+    both, readings = np.empty((shape[0] * shape[1], count)), np.empty((count, count))
+    product = matrix.toarray() if is_dense(matrix) else matrix
+    for start in range(0, count, COLUMNS):
+        part = slice(start, min(start + COLUMNS, count))
+        waves = fft.dctn(matrix[part].toarray().reshape(-1, *fine), 2, axes=(1, 2), norm="ortho", workers=processors())
+        waves *= spectrum
+        spread = np.asarray(fft.idctn(waves, 2, axes=(1, 2), norm="ortho", workers=processors(), overwrite_x=True))
+        means = spread.reshape(-1, shape[0], detail, shape[1], detail).mean(axis=(2, 4))
+        both[:, part] = means.reshape(len(spread), -1).T
+        readings[:, part] = product @ spread.reshape(len(spread), -1).T
+    vertical, horizontal = (np.square(cosine_waves(size)) for size in shape)
+    pixels = (vertical @ averaged_spectrum(spectrum, detail) @ horizontal.T).ravel()
+    return Moments(pixels, both, (readings + readings.T) / 2)
 
 
 def prior_precision(prior: float | FloatArray, shape: tuple[int, int]) -> FloatArray:
@@ -330,29 +122,256 @@ def precision_map(
     return np.array([posterior, missing, noisy], dtype=np.float64).reshape(3, *shape)
 
 
-def _interpolated(
-    local: FloatArray, shape: tuple[int, int], rows: NDArray[np.intp], columns: NDArray[np.intp]
-) -> FloatArray:
-    """Return values at places from edge to edge of a frame, (.., .., n), at some of its pixels: (n, rows, columns)."""
-    if local.shape[:2] == (1, 1):
-        return np.broadcast_to(local[0, 0, :, None, None], (local.shape[2], rows.size, columns.size))
-    down, across = (
-        CubicSpline(np.linspace(0, size, PLACES), np.eye(PLACES))(index + 0.5)
-        for size, index in zip(shape, (rows, columns), strict=True)
-    )
-    return np.einsum("ri,ijk,cj->krc", down, local, across, optimize=True)
+def information(matrix: sparse.csr_array, weights: FloatArray) -> FloatArray:
+    """Return H^T diag(w) H of few pixels: (N, N)."""
+    weighted = sparse.csr_array(matrix.multiply(weights[:, None]))
+    if is_dense(matrix):
+        return np.asarray(matrix.toarray().T @ weighted.toarray(), dtype=np.float64)
+    return np.asarray((matrix.T @ weighted).toarray(), dtype=np.float64)
 
 
-def _transfer(kernel: FloatArray) -> FloatArray:
-    """Return the squared transfer function at the waves of a DCT-II of GRID pixels, of both slants: (2, GRID, GRID)."""
-    period = 2 * GRID
-    padded = np.pad(kernel, [(0, -size % period) for size in kernel.shape])  # a wider kernel is folded
-    folded: FloatArray = padded.reshape(padded.shape[0] // period, period, -1, period).sum(axis=(0, 2))
-    spectrum = np.square(np.abs(np.asarray(fft.rfft2(folded))))[:, :GRID]
-    return np.stack([spectrum[:GRID], spectrum[-np.arange(GRID)]])
+@dataclass(frozen=True)
+class SmallFrame:
+    """A frame with the edges of a larger one, whose maps are exact for noise that is even over a lens type."""
+
+    like: Bands
+
+    @cached_property
+    def matrices(self) -> list[sparse.csr_array]:
+        """H of each lens type."""
+        return [each.matrix(self.like.spectrum.shape, self.like.detail) for each in self.like.types]
+
+    @cached_property
+    def _moments(self) -> Moments:
+        matrix = sparse.csr_array(sparse.vstack(self.matrices, format="csr"))
+        return moments(matrix, self.like.spectrum, self.like.detail)
+
+    @cached_property
+    def _parts(self) -> list[FloatArray]:
+        """H^T H of each lens type where the unknowns are f's pixels: (N, N)."""
+        return [information(matrix, np.ones(matrix.shape[0])) for matrix in self.matrices]
+
+    @cached_property
+    def _precision(self) -> FloatArray:
+        return prior_precision(1 / self.like.spectrum, self.like.shape)
+
+    def maps(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return the three maps, (3, rows, columns), for all weights times `level`.
+
+        ratios : of the actual to the expected noise of each lens type
+        """
+        like, weights = self.like, level * np.array(self.like.weights)
+        if like.detail > 1:
+            noise, every = 1 / self.of_readings(weights), self.of_readings(np.array(ratios))
+            return self._moments.variances(noise, every * noise, like.shape)
+        first, excess = ratios[0], None
+        for part, weight, ratio in zip(self._parts, weights, ratios, strict=True):
+            if not np.isclose(ratio, first, rtol=1e-12):
+                excess = (ratio - first) * weight * part + (0.0 if excess is None else excess)
+        parts = (weight * part for part, weight in zip(self._parts, weights, strict=True))
+        return precision_map(sum(parts, self._precision), 1 / like.spectrum, like.shape, first, excess)
+
+    def of_readings(self, of_types: FloatArray) -> FloatArray:
+        """Return the value of each reading's lens type: (readings,)."""
+        return np.repeat(of_types, [matrix.shape[0] for matrix in self.matrices])
 
 
-def enlarged(variance: FloatArray, shape: tuple[int, int]) -> FloatArray:
+@dataclass(frozen=True)
+class SmallFrames:
+    """Maps of a frame from small ones with the same edges, whose middle represents any interior.
+
+    Where lens types leave a null space, errors of waves that these do not see reach from edge to edge. An edge has as
+    many such waves in a frame of any length n, so that their part in a variance falls with 1 / n, which two lengths
+    show.
+    """
+
+    shape: tuple[int, int]
+    parts: list[tuple[float, SmallFrame]]
+
+    @classmethod
+    def of(cls, task: EstimationTask, bands: Bands, *, far: bool) -> SmallFrames:
+        """Return those of a task's frame; far : True where errors reach from edge to edge."""
+        side = LONG if far else FINE_SIDE if task.finer > 1 else SIDE
+        lengths = product(*(_lengths(size, side, far=far) for size in bands.shape))
+        parts = [(one * two, _with_shape(bands, task, (down, across))) for (down, one), (across, two) in lengths]
+        return cls(bands.shape, [(share, SmallFrame(like)) for share, like in parts])
+
+    def maps(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return the three maps for all weights times `level`: (3, rows, columns)."""
+        found = [
+            np.stack([_enlarged(each, self.shape) for each in small.maps(level, ratios)]) for _, small in self.parts
+        ]
+        total = sum((share * each for (share, _), each in zip(self.parts, found, strict=True)), np.zeros_like(found[0]))
+        return np.maximum(total, LEAST_SHARE * found[0])
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Maps of a frame of independent pixels from strips along its edges, as long as these.
+
+    Along an edge that some lens types do not see, errors reach to its ends. Pixels beside a strip count as known, so
+    that at a corner the larger one of two variances is the more accurate one. The middle of a strip represents any
+    interior.
+
+    along : frames of twice the depth of a strip, with left and right edges, then with those at the top and the bottom
+    """
+
+    shape: tuple[int, int]
+    prior: float
+    along: tuple[SmallFrame, SmallFrame]
+
+    @classmethod
+    def of(cls, task: EstimationTask, bands: Bands, prior: float) -> Strips:
+        """Return those of a task's frame; prior : 1 / P0."""
+        deep = DEEP * max(max(each.kernel.shape) for each in bands.types)
+        rows, columns = bands.shape
+        left, top = (rows, min(2 * deep, columns)), (min(2 * deep, rows), columns)
+        along = tuple(SmallFrame(_with_shape(bands, task, each)) for each in (left, top))
+        return cls(bands.shape, prior, (along[0], along[1]))
+
+    def maps(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return the three maps for all weights times `level`: (3, rows, columns)."""
+        total = np.zeros((3, *self.shape))
+        for axis, frame in zip((1, 0), self.along, strict=True):
+            size, wide = self.shape[axis], frame.like.shape[axis]
+            deep = wide if wide == size else wide // 2
+            half = size if deep == size else deep // 2
+            view = total if axis == 1 else total.swapaxes(1, 2)
+            for first in {0, wide - deep}:
+                part = self._strip(frame, level, ratios, axis, slice(first, first + deep))
+                kept = part[:, :, :half] if first == 0 else part[:, :, deep - half :]
+                place = view[:, :, :half] if first == 0 else view[:, :, size - half :]
+                np.copyto(place, kept, where=kept[0] > place[0])
+        middle = total[:, self.shape[0] // 2, min(self.along[0].like.shape[1] // 4 - 1, self.shape[1] // 2)]
+        return np.where(total[0] > 0, total, middle[:, None, None])
+
+    def _strip(self, frame: SmallFrame, level: float, ratios: tuple[float, ...], axis: int, lines: slice) -> FloatArray:
+        """Return the maps of lines of a frame along its edge: (3, length, depth)."""
+        numbers = np.arange(frame.like.shape[0] * frame.like.shape[1]).reshape(frame.like.shape)
+        pixels = (numbers if axis == 1 else numbers.T)[:, lines]
+        matrix = sparse.csr_array(sparse.vstack(frame.matrices, format="csr"))[:, pixels.ravel()]
+        weights, every = (frame.of_readings(np.array(each)) for each in (frame.like.weights, ratios))
+        reach = max(max(each.kernel.shape) for each in frame.like.types)
+        return swept_maps(matrix, level * weights, every, self.prior, pixels.shape, reach)
+
+
+def frame_map(task: EstimationTask, system: FrameSystem, bands: Bands, actual: FloatArray, *, far: bool) -> VarianceMap:
+    """Return the map of a frame whose lens types see the same everywhere, as `bands` do.
+
+    actual : (measurements used,) noise;  far : True where errors reach from edge to edge
+    """
+    ratios, shape = mean_ratios(task, system.weights, actual), bands.shape
+    grid = _with_shape(bands, task, (min(GRID, shape[0]), min(GRID, shape[1])))
+    if isinstance(system.prior, float) and is_narrow(task) and not far:
+        even = Strips.of(task, bands, system.prior)
+    else:
+        even = SmallFrames.of(task, bands, far=far)
+
+    def interior(value: float) -> FloatArray:
+        return np.array(grid.variances(float(np.exp(value)), ratios))[:, None, None]
+
+    def inside(value: float) -> FloatArray:
+        return np.broadcast_to(interior(value), (3, *shape))
+
+    def edges(value: float) -> FloatArray:
+        return even.maps(float(np.exp(value)), ratios) / np.maximum(interior(value), np.finfo(float).tiny)
+
+    return by_levels(np.log(levels(task, system)), inside, edges)
+
+
+def ways_to_edges(task: EstimationTask, bands: Bands) -> list[bool]:
+    """Return whether errors reach from edge to edge; both, the faster one first, where that depends on the noise.
+
+    They do where lens types leave a null space, and may along edges that some of them do not see.
+    """
+    if task.finer > 1 or leaves_null_space(task.model.camera):
+        return [task.finer == 1]
+    return [False] if is_narrow(task) or not unseen_corners(bands) else [False, True]
+
+
+def is_narrow(task: EstimationTask) -> bool:
+    """Return True if K couples near pixels alone: independent pixels, which sharp lenses see."""
+    return task.finer == 1 and task.prior.kind == "independent" and task.model.camera.has_sharp_footprints
+
+
+def unseen_corners(bands: Bands) -> list[tuple[int, int]]:
+    """Return the corner pixels of f, (row, column), where two edges meet that some lens types do not see."""
+    ends: list[list[int]] = []
+    for axis, size in enumerate(bands.shape):
+        seen = [
+            (each.first[axis], bands.detail * (each.count[axis] - 1) + each.kernel.shape[axis]) for each in bands.types
+        ]
+        unseen = any(first > 0 for first, _ in seen), any(sum(each) < size * bands.detail for each in seen)
+        ends.append([place for place, missing in zip((0, size - 1), unseen, strict=True) if missing])
+    return list(product(*ends))  # type: ignore[arg-type]
+
+
+def is_uneven(task: EstimationTask, system: FrameSystem) -> bool:
+    """Return True if the noise of neighbouring pixels differs."""
+    return float(np.ptp(np.log(levels(task, system)))) > EVEN_EDGES
+
+
+def _with_shape(bands: Bands, task: EstimationTask, shape: tuple[int, int]) -> Bands:
+    """Return the bands of a smaller frame with the same edges."""
+    by = bands.shape[0] - shape[0], bands.shape[1] - shape[1]
+    fine = shape[0] * bands.detail, shape[1] * bands.detail
+    spectrum = np.broadcast_to(1 / np.asarray(task.precision_on(fine)), fine)
+    types = tuple(each.shortened(by) for each in bands.types)
+    return replace(bands, shape=shape, spectrum=spectrum, types=types, scale=1.0)
+
+
+def _lengths(size: int, side: int, *, far: bool) -> list[tuple[int, float]]:
+    """Return the sides of small frames along an axis and their shares in the variances of the large one."""
+    if not far or size <= side:
+        return [(min(side, size), 1.0)]
+    share = (1 / size - 1 / LONG) / (1 / SHORT - 1 / LONG)
+    return [(LONG, 1 - share), (SHORT, share)]
+
+
+def by_levels(level: FloatArray, inside: Maps, edges: Maps) -> VarianceMap:
+    """Return the map of pixels at levels of the noise, logarithms, (rows, columns).
+
+    inside, edges : from a level to the three maps of a frame without edges, and to the ratios of those with edges
+    """
+    pairs = zip(between(level, INTERIOR, EVEN, inside), between(level, EDGES, EVEN_EDGES, edges), strict=True)
+    return VarianceMap(*(one * other for one, other in pairs))
+
+
+def between(level: FloatArray, most: int, even: float, maps: Maps) -> list[FloatArray]:
+    """Return maps at each pixel's level, between those of at most `most` levels, whose logarithms are interpolated.
+
+    even : range of levels that count as one
+    """
+    low, high = float(level.min()), float(level.max())
+    if high - low <= even:
+        return list(maps((low + high) / 2))
+    count = min(most, 2 + int((high - low) * most))
+    values = np.linspace(low, high, count)
+    place = (level - low) / (high - low) * (count - 1)
+    total: list[FloatArray] = []
+    tiny = np.finfo(float).tiny
+    for number, value in enumerate(values):
+        share = np.maximum(1 - np.abs(place - number), 0.0)
+        parts = [share * np.log(np.maximum(each, tiny)) for each in maps(float(value))]
+        total = parts if not total else [one + part for one, part in zip(total, parts, strict=True)]
+    return [np.exp(each) for each in total]
+
+
+def levels(task: EstimationTask, system: FrameSystem) -> FloatArray:
+    """Return the weights of each pixel's measurements relative to the means of their lens types: (rows, columns)."""
+    local, average = (task.of_f(each) for each in system.local_weights)
+    relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
+    return np.maximum(relative, LEAST_LEVEL).reshape(task.shape_of_f)
+
+
+def mean_ratios(task: EstimationTask, weights: FloatArray, actual: FloatArray) -> tuple[float, ...]:
+    """Return the ratio of the actual to the expected noise of each lens type, weighted as the estimator weighs it."""
+    ratios = task.on_all_measurements(actual / task.expected_noise, 0.0)
+    parts = [(weights[part], ratios[part]) for part in task.model.camera.type_slices()]
+    return tuple(float(np.mean(weight * ratio)) / (float(weight.mean()) or 1.0) for weight, ratio in parts)
+
+
+def _enlarged(variance: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Return the map of a small frame for a frame of `shape`."""
     return variance[np.ix_(*(_small_index(*sizes) for sizes in zip(shape, variance.shape, strict=True)))]
 

@@ -28,7 +28,7 @@ from ommatid.runtime.machine import check_memory, processors
 
 from ..camera import Camera
 from ..lens_type import LensType
-from ..observation import Back, ComplexArray, ObservationPart, Seen, cosines, density, padded_shape
+from ..observation import Back, ComplexArray, ObservationPart, Seen, padded_shape
 from .kernel_shapes import KernelShapes, Numbers
 
 VALUES_AT_ONCE = 2**24  # of kernels that are made for a part of the pixels
@@ -438,50 +438,6 @@ class KernelFootprints(ObservationPart):
         down, across = (legendre.legvander(axis, self.degree).mean(axis=0) for axis in self.places.field)
         return np.asarray(np.einsum("sab,a,b->s", self._products(self.coefficients), down, across))
 
-    @property
-    def _densities(self) -> tuple[float, float]:
-        """Readings per row and per column of f."""
-        rows, columns = (
-            density(start, self.places.width, size) for start, size in zip(self.places.starts, self.shape, strict=True)
-        )
-        return rows, columns
-
-    def information(self) -> FloatArray:
-        """Return the mean of H^T H far from the edges, under the DCT-II: (rows, columns)."""
-        wide, (down, across) = self.places.width, self._densities
-        power = np.square(np.abs(fft.rfft2(self.mean_kernel, (2 * wide, 2 * wide))))
-        lags = np.asarray(fft.irfft2(power, (2 * wide, 2 * wide)))
-        mirrored = lags[:wide, -np.arange(wide)]  # lags down and to the left
-        even = (lags[:wide, :wide] + mirrored) / 2
-        rows, columns = (cosines(size, wide) for size in self.shape)
-        return np.maximum(down * across * (rows @ even @ columns.T), 0.0)
-
-    def edge_information(self, axis: int, strip: slice) -> FloatArray:
-        """Return H^T H of a strip along an edge, with its mean along the edge under the DCT-II."""
-        kernel = self.mean_kernel if axis == 0 else self.mean_kernel.T
-        wide, length, depth = self.places.width, self.shape[1 - axis], strip.stop - strip.start
-        angles = np.outer(np.pi * np.arange(length) / length, np.arange(wide))
-        index, roots = _near(self.places.starts[axis], wide, strip)
-        shares = np.pad(kernel, ((0, 1), (0, 0)))[index]
-        shares *= roots[:, None, None] * self._densities[1 - axis] ** 0.5
-        total = np.zeros((length, depth, depth))
-        for waves in (np.cos(angles), np.sin(angles)):
-            read = np.moveaxis(shares @ waves.T, 2, 0)  # (length, readings, depth)
-            total += read.swapaxes(1, 2) @ read
-        return total
-
-    def corner_information(self, rows: slice, columns: slice) -> FloatArray:
-        """Return H^T H of a small window: (its pixels, its pixels)."""
-        wide, (tops, lefts) = self.places.width, self.places.starts
-        (down, roots), (across, factors) = _near(tops, wide, rows), _near(lefts, wide, columns)
-        kernel, size = np.pad(self.mean_kernel, ((0, 1), (0, 1))), down.shape[1] * across.shape[1]
-        total = np.zeros((size, size))
-        for index, root in zip(down, roots, strict=True):  # of one sensor row at a time, to bound memory
-            read = root * factors[:, None, None] * kernel[index][:, across].swapaxes(0, 1)
-            read = read.reshape(factors.size, size)
-            total += read.T @ read
-        return total
-
     def error_directions(self, image: FloatArray) -> FloatArray:
         """Return L, (measurements of the type, q): the error of H f is L xi, with independent xi of variance 1."""
         padded, image = padded_shape(self.shape, self.reach, self.spacing), np.asarray(image, dtype=np.float64)
@@ -529,17 +485,6 @@ def _folded(half: ComplexArray, size: int, length: int) -> ComplexArray:
         else:  # the conjugates of those of negative frequencies
             total += np.conj(half[:, size - first - kept : size - first + 1][:, ::-1])
     return total
-
-
-def _near(starts: IntArray, wide: int, part: slice) -> tuple[IntArray, FloatArray]:
-    """Return the row of the kernel, `wide` beside it, at pixels of a part, and the root of the number of such kernels.
-
-    starts : where kernels begin along an axis;  both for each different start near the part: (n, pixels), (n,)
-    """
-    near, counts = np.unique(starts[(starts + wide > part.start) & (starts < part.stop)], return_counts=True)
-    pixels: IntArray = np.asarray(range(part.start, part.stop), dtype=np.int64)
-    index = pixels - near[:, None]
-    return np.where((index >= 0) & (index < wide), index, wide), np.sqrt(counts)
 
 
 def read_kernels(camera: Camera, description: dict[str, Any], arrays: dict[str, Any]) -> KernelFootprints:

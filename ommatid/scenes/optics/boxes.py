@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
 from math import lcm
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,7 @@ from scipy import sparse
 from ommatid.runtime.arrays import FloatArray, IntArray
 
 from ..lens_type import LensType
-from ..observation import Back, ObservationPart, Seen, cosines, density, on_lines, repetition
+from ..observation import Back, ObservationPart, Seen, on_lines, repetition
 
 if TYPE_CHECKING:
     from ..camera import Camera
@@ -51,19 +50,6 @@ class BoxAxis:
     def width(self) -> int:
         """Largest number of pixels in an interval."""
         return int(np.diff(self.shares.indptr).max())
-
-    @cached_property
-    def gram(self) -> sparse.csr_array:
-        """D^T D of the shares D: (size, size), banded."""
-        return sparse.csr_array(self.shares.T @ self.shares)
-
-    @cached_property
-    def information(self) -> FloatArray:
-        """The mean of `gram` over the pixels that intervals reach, under the DCT-II: (size,)."""
-        size = self.shares.shape[1]
-        starts = self.shares @ np.arange(size)  # their middles serve as well
-        lags = np.array([self.gram.diagonal(lag).sum() for lag in range(min(self.width, size))])
-        return cosines(size, lags.size) @ lags * (density(starts, self.width, size) / starts.size)
 
 
 @dataclass(frozen=True)
@@ -138,20 +124,6 @@ class Box(ObservationPart):
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """A key that is equal for two windows only if their submatrices are equal."""
         return _pattern(self.down, rows), _pattern(self.across, columns)
-
-    def information(self) -> FloatArray:
-        """The mean of H^T H far from the edges, under the DCT-II: (rows, columns)."""
-        return np.outer(self.down.information, self.across.information)
-
-    def edge_information(self, axis: int, strip: slice) -> FloatArray:
-        """H^T H of a strip along an edge, with its mean along the edge under the DCT-II: (length, depth, depth)."""
-        through, along = (self.down, self.across) if axis == 0 else (self.across, self.down)
-        return along.information[:, None, None] * through.gram[strip, strip].toarray()
-
-    def corner_information(self, rows: slice, columns: slice) -> FloatArray:
-        """H^T H of a small window: (its pixels, its pixels)."""
-        down, across = self.down.gram[rows, rows].toarray(), self.across.gram[columns, columns].toarray()
-        return np.asarray(np.kron(down, across), dtype=np.float64)
 
 
 def designed_box(shape: tuple[int, int], lens_type: LensType) -> Box:

@@ -182,7 +182,7 @@ class SensorLayout:
 class RecordedFrames:
     """Recorded digital numbers, (exposures, M), and the means of dark and flat frames, (M,).
 
-    averaged : number of dark or of flat frames, whichever is smaller
+    darks, flats : number of dark and of flat frames
     files : the last file of each exposure;  sources : names and SHA-256 of all files
     whole : True if all numbers are integers, rounded by the sensor
     notes : what is lost or changed when the files are read, a sentence each
@@ -192,7 +192,8 @@ class RecordedFrames:
     numbers: FloatArray
     dark: FloatArray | None
     flat: FloatArray | None
-    averaged: int
+    darks: int
+    flats: int
     settings: AcquisitionSettings
     files: list[Path]
     whole: bool
@@ -261,7 +262,8 @@ def read_frames(
         numbers=numbers,
         dark=_mean(dark_frames),
         flat=_mean(flat_frames),
-        averaged=min(len(dark_frames), len(flat_frames)),
+        darks=len(dark_frames),
+        flats=len(flat_frames),
         settings=settings,
         files=[path for path, _ in exposures],
         whole=bool((numbers == np.rint(numbers)).all()),
@@ -360,8 +362,9 @@ def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Rec
     A single dark or flat frame is taken for the mean of `sensor.frames`; of several, their number is used instead.
     """
     dark, flat = frames.conversion(source)
-    if frames.averaged > 1:
-        sensor = sensor.model_copy(update={"frames": frames.averaged})
+    averaged = min(frames.darks, frames.flats)
+    if averaged > 1:
+        sensor = sensor.model_copy(update={"frames": averaged})
     digital, dark, flat = (_as_float32(values) for values in (frames.numbers[0], dark, flat))
     return Recording(sensor, digital, dark, flat, np.full(digital.size, frames.settings.flat_value))
 

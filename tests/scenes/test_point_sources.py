@@ -171,7 +171,7 @@ def test_a_sub_imager_that_saw_no_point_is_refused(imaging_camera: Camera, ommat
     truth[-12:] = 0
     np.save("points.npy", sweep(imaging_camera, truth.tocsr(), 2, np.random.default_rng(3)))
     ended = ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz")
-    assert (ended.code, "got noise alone in II.02.02; check --origin" in ended.err) == (2, True)
+    assert (ended.code, "got noise alone in that of II.02.02; check --origin" in ended.err) == (2, True)
 
 
 def test_points_that_leave_a_pixel_dark_are_dark_frames_of_it(imaging_camera: Camera, ommatid: Command) -> None:

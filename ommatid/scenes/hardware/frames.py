@@ -182,7 +182,7 @@ class SensorLayout:
 class RecordedFrames:
     """Recorded digital numbers, (exposures, M), and the means of dark and flat frames, (M,).
 
-    darks, flats : number of dark and of flat frames
+    darks : number of dark frames;  averaged : that, or the number of flat frames if it is smaller
     files : the last file of each exposure;  sources : names and SHA-256 of all files
     whole : True if all numbers are integers, rounded by the sensor
     notes : what is lost or changed when the files are read, a sentence each
@@ -193,7 +193,7 @@ class RecordedFrames:
     dark: FloatArray | None
     flat: FloatArray | None
     darks: int
-    flats: int
+    averaged: int
     settings: AcquisitionSettings
     files: list[Path]
     whole: bool
@@ -263,7 +263,7 @@ def read_frames(
         dark=_mean(dark_frames),
         flat=_mean(flat_frames),
         darks=len(dark_frames),
-        flats=len(flat_frames),
+        averaged=min(len(dark_frames), len(flat_frames)),
         settings=settings,
         files=[path for path, _ in exposures],
         whole=bool((numbers == np.rint(numbers)).all()),
@@ -362,9 +362,8 @@ def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Rec
     A single dark or flat frame is taken for the mean of `sensor.frames`; of several, their number is used instead.
     """
     dark, flat = frames.conversion(source)
-    averaged = min(frames.darks, frames.flats)
-    if averaged > 1:
-        sensor = sensor.model_copy(update={"frames": averaged})
+    if frames.averaged > 1:
+        sensor = sensor.model_copy(update={"frames": frames.averaged})
     digital, dark, flat = (_as_float32(values) for values in (frames.numbers[0], dark, flat))
     return Recording(sensor, digital, dark, flat, np.full(digital.size, frames.settings.flat_value))
 

@@ -1,13 +1,10 @@
 """H from recorded point sources, each of which lights one pixel of f while the others are black.
 
-A reading of sensor pixel i less its dark level, divided by the value of the source on pixel j, is the entry H_ij. It is
-used if the source lies within a margin of the ideal footprint of the sensor pixel, or next to sources whose light, each
-without others, exceeds the noise of the sensor pixel. No reading is used for being high, which would bias it: those at
-the edge of a footprint come with it. Several sources of one frame must be further apart than a footprint, and a sensor
-pixel near to two of them is assigned to the nearer one.
-
-The dark level of a sensor pixel is the mean of its dark frames and of its readings without light. Its error is common
-to the entries of a row.
+A reading of sensor pixel i less its dark level, divided by the value of the source on pixel j, is the entry H_ij. A
+reading is used if the ideal footprint of the sensor pixel, widened by a margin, contains the source, or if the source
+was lit alone, and it or a neighbour exceeds the noise: readings chosen for being high alone would be biased. Several
+sources of one frame must be further apart than a footprint, and a sensor pixel near to two of them is assigned to the
+nearer one. Dark levels are means of dark frames and of readings without light; their errors are common to rows of H.
 """
 
 from __future__ import annotations
@@ -25,7 +22,7 @@ import numpy as np
 from scipy import ndimage, optimize, sparse, stats
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
-from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.errors import InputError, named, shortened
 from ommatid.runtime.files import fingerprint
 from ommatid.runtime.input_files import read_text
 from ommatid.runtime.versions import versions
@@ -226,7 +223,7 @@ class Background:
     level, frames : mean of unlit readings and dark frames, and their number
     variance : of an unlit reading, NaN in a sub-imager without any
     far : (exposures, M) True for readings that a lone source may reach
-    stray : number of readings that exceed the noise though no source of several reaches them
+    stray : number of readings with several sources that exceed the noise
     """
 
     level: FloatArray
@@ -357,39 +354,39 @@ def background(camera: Camera, readings: FloatArray, near: BoolArray, lone: IntA
 
     near : True for readings in the footprint of a source;  lone : (exposures,) pixel of f of the only source, or -1
     darks : number of dark frames, whose mean was subtracted; infinite if the dark level is known to be 0
-
-    A lone source is tested with its neighbours, by the sum of all their readings of a sensor pixel.
     """
-    finite = np.isfinite(readings)
-    outside, alone = finite & ~near, np.flatnonzero(lone >= 0)
-    score, starts = _score(int(outside.sum())), [pixels.start for pixels in camera.slices()]
+    single, alone = lone >= 0, np.flatnonzero(lone >= 0)
     sweeps = sparse.csr_array((np.ones(alone.size), (lone[alone], alone)), shape=(camera.unknowns, lone.size))
+    score, window = _score(int(np.sum(np.isfinite(readings) & ~near))), np.ones((WIDTH, WIDTH, 1))
 
     def around(values: FloatArray) -> FloatArray:
-        of_source = np.asarray(sweeps @ values).reshape((*camera.shape, level.size))
-        return ndimage.convolve(of_source, np.ones((WIDTH, WIDTH, 1)), mode="constant")
+        """Sum the readings of each lone source and its neighbours: (exposures, pixels) to (rows, columns, pixels)."""
+        of_source = np.asarray(sweeps @ values).reshape((*camera.shape, values.shape[1]))
+        return ndimage.convolve(of_source, window, mode="constant")
 
-    # Medians at first: a mean square would hide the light of a sub-image that lies beside its footprints altogether.
-    level = _median(readings, outside)
-    variance = (_median(np.abs(readings - level), outside) / MEDIAN_DEVIATION) ** 2
-    count, frames, unlit, far, stray = around(finite.astype(np.float64)), level, near, near, near
-    for _ in range(ROUNDS):
-        limit, before = score * np.sqrt(np.maximum(variance, FAINTEST**2)), unlit
-        above = np.where(finite, readings - level, 0.0)
-        lit = ndimage.maximum_filter(around(above) > limit * np.sqrt(count), (WIDTH, WIDTH, 1), mode="constant")
-        far = lit.reshape(-1, level.size)[lone] & (lone >= 0)[:, None] & ~near
-        stray = outside & ~far & (above > limit)
-        unlit = outside & ~far & ~stray
-        if np.array_equal(unlit, before):
-            break
-        number, dark = unlit.sum(axis=0, dtype=np.float64), np.where(unlit, readings, 0.0)
-        frames = np.asarray(darks + number)
-        level = dark.sum(axis=0) / frames
-        squares = np.add.reduceat(np.square(dark).sum(axis=0) - level * dark.sum(axis=0), starts)
-        with np.errstate(invalid="ignore"):
-            pooled = np.maximum(squares, 0.0) / np.add.reduceat(number, starts)
-        variance = np.repeat(pooled, np.diff([*starts, level.size]))
-    return Background(level, frames, variance, far, int(stray[lone < 0].sum()))
+    (levels, frames, variances), all_far, all_stray = np.zeros((3, camera.measurements)), near.copy(), near.copy()
+    for part in camera.slices():
+        values, finite = readings[:, part], np.isfinite(readings[:, part])
+        outside, count = finite & ~near[:, part], around(finite.astype(np.float64))
+        # Medians at first: a mean square would hide the light of a sub-image that lies beside all its footprints.
+        level = _median(values, outside)
+        variance, unlit = (_median(np.abs(values - level), outside) / MEDIAN_DEVIATION) ** 2, finite
+        for _ in range(ROUNDS):
+            limit, before = score * np.sqrt(np.maximum(variance, FAINTEST**2)), unlit
+            above = np.where(finite, values - level, 0.0)
+            lit = ndimage.maximum_filter(around(above) > limit * np.sqrt(count), window.shape, mode="constant")
+            far = lit.reshape(-1, level.size)[lone] & single[:, None] & ~near[:, part]
+            stray = outside & ~far & (above > limit)
+            unlit = outside & ~far & ~stray
+            number, dark = unlit.sum(axis=0), np.where(unlit, values, 0.0)
+            level = dark.sum(axis=0) / (darks + number)
+            squares = max(float(np.sum(np.square(dark) - level * dark)), 0.0)
+            variance = np.full(level.size, squares / number.sum() if number.any() else np.nan)
+            levels[part], frames[part], variances[part] = level, darks + number, variance
+            all_far[:, part], all_stray[:, part] = far, stray
+            if np.array_equal(unlit, before):
+                break
+    return Background(levels, frames, variances, all_far, int(np.sum(all_stray[~single])))
 
 
 def _median(values: FloatArray, used: BoolArray) -> FloatArray:
@@ -456,10 +453,9 @@ def _check_seen(camera: Camera, entries: RecordedEntries, variance: FloatArray, 
     ]
     blind = [name for name, part in parts if recorded[part].any() and not seen[part].any()]
     if blind:
-        others = f" and {len(blind) - 1} more" if len(blind) > 1 else ""
         raise InputError(
-            f"--points: expected light of the points in every sub-image, got noise alone in {blind[0]}{others}; check"
-            " --origin, --upright and the rotation of the sensor, and record one point per image"
+            "--points: expected light of the points in every sub-image, got noise alone in that of"
+            f" {named(blind)}; check --origin, --upright and the rotation of the sensor, and record one point per image"
         )
 
 

@@ -37,7 +37,7 @@ class Model:
     """H as `stored` (CSR, float64), or None where boxes and kernels apply it; `variance` of each stored entry.
 
     batches : (B, nnz) deviations of B independent estimates of the entries from their mean `stored`; B is 0 without
-        uncertainty
+        uncertainty. Entries of recorded points have one: the standard deviation that the entries of a row share
     record : how H was determined: method, samples, seconds, agreement with the ideal model, fingerprint
     fitted : the few numbers from which entries of variance 0 follow, with their errors; None: every entry by itself
     """
@@ -183,7 +183,8 @@ class Model:
         sum over j of var_ij (f_j - (H f)_i)^2; light that is lost beside the target is one more entry, where f is 0.
         Errors of neighbouring entries cancel too where the image is smooth; the scatter of H f over the batches, shrunk
         among pixels of a lens type with similar contrast, shows by how much.
-        Entries of recorded points were measured one by one, and nothing cancels: sum over j of var_ij f_j^2.
+        Entries of recorded points were measured one by one, and nothing cancels: sum over j of var_ij f_j^2, and the
+        square of the sum of what they share.
 
         noise : random images with the noise of `image`, whose scatter is not that of the true image and is subtracted
         """
@@ -192,9 +193,9 @@ class Model:
         flat = np.asarray(image, dtype=np.float64).ravel()
         contrast = flat[self.matrix.indices]
         level = self.matrix @ flat
-        if self.record["method"] != RECORDED:
-            contrast = contrast - level[self._rows]
-        variance = self._row_sums(self.variance * contrast**2)
+        if self.record["method"] == RECORDED:
+            return self._row_sums(self.variance * contrast**2) + self._shared_variance(contrast)
+        variance = self._row_sums(self.variance * (contrast - level[self._rows]) ** 2)
         count = len(self.batches)
         if count < 2:
             return variance
@@ -269,8 +270,13 @@ class Model:
             return np.zeros(self.measurements)
         variance = self._row_sums(self.variance * prior_variance[self.matrix.indices])
         if self.record["method"] == RECORDED:
-            return variance + self._row_sums(self.variance) * prior_mean**2
+            level = np.sqrt(prior_variance + prior_mean**2)[self.matrix.indices]
+            return variance + self._row_sums(self.variance) * prior_mean**2 + self._shared_variance(level)
         return variance + self._lost_variance * prior_mean**2
+
+    def _shared_variance(self, values: FloatArray) -> FloatArray:
+        """Variance of H f by the errors that recorded entries of a row share; values : (nnz,) of f at the entries."""
+        return sum((self._row_sums(batch * values) ** 2 for batch in self.batches), np.zeros(self.measurements))
 
     def _row_sums(self, entries: FloatArray) -> FloatArray:
         return np.bincount(self._rows, weights=entries, minlength=self.measurements).astype(np.float64)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ommatid.scenes.hardware.point_sources import background, photon_transfer, rounding
+from ommatid.scenes.hardware.point_sources import CHANCE, background, photon_transfer, rounding
+
+from ..examples import camera
 
 GAIN, READ = 0.02, 0.3  # units of f: of one electron, and of the read noise
 
@@ -23,23 +25,29 @@ def test_photon_transfer_finds_dark_and_photon_noise() -> None:
 
 
 @pytest.mark.parametrize("deviation", [0.0, 0.1, 0.2, 0.4])
-def test_rounding_is_an_upper_bound_within_a_factor_of_two(deviation: float) -> None:
+def test_rounding_is_an_upper_bound_within_a_factor_of_three(deviation: float) -> None:
     """The exact mean of rounded normal readings, averaged over positions between two steps by the trapezoidal rule."""
     steps = np.arange(-8, 9)
     positions = np.linspace(-0.5, 0.5, 201)[:, None]
     if deviation == 0:
-        mean = np.rint(positions[:, 0])
+        mean, square = np.rint(positions[:, 0]), np.rint(positions[:, 0]) ** 2
     else:
         above, below = (stats.norm.cdf((steps + half - positions) / deviation) for half in (0.5, -0.5))
-        mean = (above - below) @ steps
+        mean, square = (above - below) @ steps, (above - below) @ steps**2
     variance = np.trapezoid((mean - positions[:, 0]) ** 2, positions[:, 0])
-    bound = float(rounding(np.array([deviation**2]), np.ones(1))[0])
+    of_readings = np.trapezoid(square - mean**2, positions[:, 0])
+    bound = float(rounding(np.array([of_readings]), np.ones(1))[0])
     step_error = 3 / 200  # of the trapezoidal rule without noise, where the integrand jumps
-    assert variance == pytest.approx(bound, rel=step_error) if deviation == 0 else 0.5 * bound < variance <= bound
+    assert variance == pytest.approx(bound, rel=step_error) if deviation == 0 else bound / 3 < variance <= bound
 
 
-def test_background_takes_noise_for_light_at_the_stated_rate() -> None:
-    rng = np.random.default_rng(1)
-    false_alarms = [(noise > background(noise, 0.05)[1]).any() for noise in rng.normal(0, 1, (200, 10000))]
-    assert stats.binomtest(int(np.sum(false_alarms)), 200, 0.05).pvalue > 0.001
-    assert background(np.append(rng.normal(0, 1, 200), 30.0), 0.01)[0] == pytest.approx(1, abs=5 * (2 / 200) ** 0.5)
+@pytest.mark.parametrize("sources", [1, 2])
+def test_background_takes_noise_for_light_at_the_stated_rate(sources: int) -> None:
+    """Of sources lit alone, whose neighbours are tested together, and of several, whose readings are tested by one."""
+    rng, small = np.random.default_rng(1), camera((12, 12), (("1/3", [2, 2], [3, 3]),))
+    lone = np.arange(small.unknowns) if sources == 1 else np.full(small.unknowns, -1)
+    near = np.zeros((small.unknowns, small.measurements), dtype=bool)
+    found = [background(small, noise, near, lone, 8) for noise in rng.normal(0, 1, (100, *near.shape))]
+    false_alarms = sum(bool(each.far.any()) or each.stray > 0 for each in found)
+    assert stats.binomtest(false_alarms, 100, CHANCE).pvalue > 0.001
+    assert np.mean([each.variance.mean() for each in found]) == pytest.approx(1, abs=5 * (2 / 100 / near.size) ** 0.5)

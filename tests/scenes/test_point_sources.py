@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,20 +86,23 @@ def test_swept_points_give_h_within_its_variance(imaging_camera: Camera, ommatid
 
 
 def test_variance_from_a_recorded_model_is_the_scatter_of_h_f(imaging_camera: Camera, tmp_path: Path) -> None:
-    """Over 200 simulated calibrations, to five standard errors of their mean square."""
+    """Over 200 simulated calibrations with errors of entries and of whole rows, to five standard errors."""
     rng = np.random.default_rng(8)
     truth, image = ideal_matrix(imaging_camera), rng.uniform(0, 255, imaging_camera.unknowns)
     entries = truth.copy()
     deviation: NDArray[np.float64] = np.linspace(0.01, 0.03, entries.nnz)
     squares: list[Array] = []
     for _ in range(200):
-        entries.data = truth.data + rng.normal(0, deviation)
+        of_rows = np.repeat(rng.normal(0, 0.01, imaging_camera.measurements), np.diff(truth.indptr))
+        entries.data = truth.data + rng.normal(0, deviation) + of_rows
         squares.append((entries @ image - truth @ image) ** 2)
-    batches = np.zeros((0, truth.nnz), dtype=np.float32)
+    batches = np.full((1, truth.nnz), 0.01, dtype=np.float32)
     scene = read(tmp_path / "scene.toml")
     recorded = Model(scene, imaging_camera, truth, deviation**2, batches, {"method": RECORDED})
     ratio = np.mean(squares, axis=0) / recorded.variance_from_model(image)
     assert ratio.mean() == pytest.approx(1, abs=5 * (2 / 200 / ratio.size) ** 0.5)
+    level = np.full(imaging_camera.unknowns, 100.0)
+    np.testing.assert_allclose(recorded.prior_variance_from_model(0 * level, 100), recorded.variance_from_model(level))
 
 
 def grids(camera: Camera, apart: int) -> list[Array]:
@@ -144,11 +148,44 @@ def with_ghost(camera: Camera) -> sparse.csr_array:
     return sparse.csr_array(ideal_matrix(camera) + last)
 
 
-def test_light_far_from_its_footprint_is_found_for_single_points(imaging_camera: Camera, ommatid: Command) -> None:
-    truth = with_ghost(imaging_camera)
-    np.save("points.npy", sweep(imaging_camera, truth, 2, np.random.default_rng(3)))
+def displaced(camera: Camera) -> sparse.csr_array:
+    """The ideal H, except that the last sub-imager, of 3 x 4 pixels, looks five and a half pixels of f to the left."""
+    shift = sparse.diags_array([0.5, 0.5], offsets=[5, 6], shape=(camera.columns, camera.columns))
+    matrix = ideal_matrix(camera)
+    moved = matrix[-12:] @ sparse.kron(sparse.eye_array(camera.rows), shift, format="csr").T
+    return sparse.csr_array(sparse.vstack([matrix[:-12], moved]))
+
+
+@pytest.mark.parametrize("light", [with_ghost, displaced])
+def test_light_far_from_its_footprint_is_found_for_single_points(
+    imaging_camera: Camera, ommatid: Command, light: Callable[[Camera], sparse.csr_array]
+) -> None:
+    truth = light(imaging_camera)
+    np.save("points.npy", sweep(imaging_camera, truth, 4, np.random.default_rng(3)))
     assert ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz").code == 0
     assert_model_is(model_file.read(Path("h.npz")), truth)
+
+
+def test_a_sub_imager_that_saw_no_point_is_refused(imaging_camera: Camera, ommatid: Command) -> None:
+    truth = ideal_matrix(imaging_camera).tolil()
+    truth[-12:] = 0
+    np.save("points.npy", sweep(imaging_camera, truth.tocsr(), 2, np.random.default_rng(3)))
+    ended = ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz")
+    assert (ended.code, "got noise alone in that of II.02.02; check --origin" in ended.err) == (2, True)
+
+
+def test_points_that_leave_a_pixel_dark_are_dark_frames_of_it(imaging_camera: Camera, ommatid: Command) -> None:
+    """The error that the dark level leaves in H f of a bright image is counted, to five standard errors, and small."""
+    truth, rng = blurred_matrix(imaging_camera), np.random.default_rng(5)
+    np.save("points.npy", 40 + sweep(imaging_camera, truth, 2, rng))
+    dark = save(Path("dark.npy"), as_mosaic(imaging_camera, rng.normal(40, READ, imaging_camera.measurements)))
+    ended = ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz", "--dark", dark)
+    assert ended.code == 0, ended.err
+    found, image = model_file.read(Path("h.npz")), np.full(imaging_camera.unknowns, 255.0)
+    counted = found.variance_from_model(image)
+    ratio = np.square(found.matrix @ image - truth @ image) / counted
+    assert ratio.mean() == pytest.approx(1, abs=5 * (2 / ratio.size) ** 0.5)
+    assert (counted < (READ * np.diff(found.matrix.indptr)) ** 2).all()  # of a single dark frame
 
 
 def test_stray_light_of_several_points_gives_a_warning(imaging_camera: Camera, ommatid: Command) -> None:

@@ -33,7 +33,8 @@ SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
 SIZE = 0.1  # relative deviation from which a number is wrong
 ROUGH = 0.05  # relative error of a map of variances from which it is a doubt
 STRIKING = 1.5  # ratio to the whole from which a region is worth naming
-UNCERTAIN = ": the uncertainty of H is more than a small correction; raise calibration.samples"
+RAISE = "raise calibration.samples, or record each point more often"
+UNCERTAIN = f": the uncertainty of H is more than a small correction; {RAISE}"
 SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 
@@ -368,13 +369,12 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
     if check.spurious > SIZE:
         findings.reasons.append(
             "the noise of H adds spurious information about pixels that the lens types determine poorly, more than the"
-            " predicted error can count; raise calibration.samples, or take calibration.method = 'ideal' if the camera"
-            " is"
+            f" predicted error can count; {RAISE}, or take calibration.method = 'ideal' if the camera is"
         )
     elif check.spurious_share > SPURIOUS_SHARE:
         findings.notes.append(
             f"the noise of H may have produced {100 * check.spurious_share:.2g} % of the information on a pixel, on"
-            " average; raise calibration.samples"
+            f" average; {RAISE}"
         )
     if check.fit_doubtful:
         findings.reasons.append(

@@ -182,7 +182,7 @@ class SensorLayout:
 class RecordedFrames:
     """Recorded digital numbers, (exposures, M), and the means of dark and flat frames, (M,).
 
-    averaged : number of dark or of flat frames, whichever is smaller
+    darks : number of dark frames;  averaged : that, or the number of flat frames if it is smaller
     files : the last file of each exposure;  sources : names and SHA-256 of all files
     whole : True if all numbers are integers, rounded by the sensor
     notes : what is lost or changed when the files are read, a sentence each
@@ -192,6 +192,7 @@ class RecordedFrames:
     numbers: FloatArray
     dark: FloatArray | None
     flat: FloatArray | None
+    darks: int
     averaged: int
     settings: AcquisitionSettings
     files: list[Path]
@@ -261,6 +262,7 @@ def read_frames(
         numbers=numbers,
         dark=_mean(dark_frames),
         flat=_mean(flat_frames),
+        darks=len(dark_frames),
         averaged=min(len(dark_frames), len(flat_frames)),
         settings=settings,
         files=[path for path, _ in exposures],

@@ -1,9 +1,10 @@
 """H from recorded point sources, each of which lights one pixel of f while the others are black.
 
-A reading of sensor pixel i, divided by the value of the source on pixel j, is the entry H_ij. A reading is used if the
-ideal footprint of the sensor pixel, widened by a margin, contains the source; beyond that only if one source was lit
-alone and the reading exceeds the noise. Several sources of one frame must be further apart than a footprint, and a
-sensor pixel near to two of them is assigned to the nearer one.
+A reading of sensor pixel i less its dark level, divided by the value of the source on pixel j, is the entry H_ij. A
+reading is used if the ideal footprint of the sensor pixel, widened by a margin, contains the source, or if the source
+was lit alone, and it or a neighbour exceeds the noise: readings chosen for being high alone would be biased. Several
+sources of one frame must be further apart than a footprint, and a sensor pixel near to two of them is assigned to the
+nearer one. Dark levels are means of dark frames and of readings without light; their errors are common to rows of H.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from time import perf_counter
 from typing import Any, cast
 
 import numpy as np
-from scipy import optimize, sparse, stats
+from scipy import ndimage, optimize, sparse, stats
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
-from ommatid.runtime.errors import InputError, shortened
+from ommatid.runtime.errors import InputError, named, shortened
 from ommatid.runtime.files import fingerprint
 from ommatid.runtime.input_files import read_text
 from ommatid.runtime.versions import versions
@@ -197,7 +198,10 @@ def _integer(text: str, name: str, where: str) -> int:
 
 
 MARGIN = 2.0  # pixels of f around an ideal footprint
-CHANCE = 0.01  # probability that any noise beyond all footprints counts as light
+WIDTH = 3  # pixels of f that are tested for light together, and reached around their middle
+FAINTEST = 1e-7  # share of the value of a source, to which float32 holds it
+MEDIAN_DEVIATION = 0.6745  # median of the absolute value of a normal deviate
+CHANCE = 0.01  # probability that any noise counts as light
 UNKNOWN_VARIANCE = 1.0  # of an entry without readings, which is a share from 0 to 1
 
 
@@ -213,14 +217,20 @@ class RecordedEntries:
 
 
 @dataclass(frozen=True)
-class StrayLight:
-    """Readings outside all footprints: their mean square per sensor pixel, (M,), NaN without readings.
+class Background:
+    """Unlit readings of each sensor pixel, (M,), and what else there is beyond the footprints.
 
-    lit : (exposures, M) True where such a reading exceeds the noise
+    level, frames : mean of unlit readings and dark frames, and their number
+    variance : of an unlit reading, NaN in a sub-imager without any
+    far : (exposures, M) True for readings that a lone source may reach
+    stray : number of readings with several sources that exceed the noise
     """
 
-    mean_square: FloatArray
-    lit: BoolArray
+    level: FloatArray
+    frames: FloatArray
+    variance: FloatArray
+    far: BoolArray
+    stray: int
 
 
 @dataclass(frozen=True)
@@ -259,13 +269,17 @@ def from_recorded_points(
         positions_by_rows(camera, frames.files) if places is None else read_positions(places, camera, frames.files)
     )
     readings = _readings(scene, frames, value)
-    entries, beyond, stray = _assign(camera, positions, frames.files, readings)
+    nearest = _nearest_sources(camera, positions, frames.files)
+    lone = np.array([int(where[0] @ (camera.columns, 1)) if len(where) == 1 else -1 for where in positions])
+    unlit = background(camera, readings, nearest >= 0, lone, frames.darks or np.inf)
+    entries = _entries(np.where(unlit.far, lone[:, None], nearest), readings - unlit.level, camera.unknowns)
     _check_complete(camera, positions, places)
     _check_separable(camera, positions, places)
     step = np.nan_to_num(frames.scale / value)
     photons = step * (0.0 if scene.sensor is None else scene.sensor.gain)
-    variance = _variance(camera, entries, beyond, step if frames.whole else 0.0 * step, photons)
+    variance, shared = _variances(camera, entries, unlit, step if frames.whole else 0.0 * step, photons)
     starts = np.searchsorted(entries.pixel, np.arange(camera.measurements + 1))
+    _check_seen(camera, entries, variance, starts)
     matrix = sparse.csr_array((entries.mean, entries.unknown, starts), shape=(camera.measurements, camera.unknowns))
     made_from = {
         "camera": camera.describe(),
@@ -283,8 +297,9 @@ def from_recorded_points(
         "versions": versions("scipy", "scikit-image", "OpenEXR"),
     }
     once = scene.sensor is None and not (entries.count > 1).any()
-    batches = np.zeros((0, entries.mean.size), dtype=np.float32)
-    return RecordedCalibration(Model(setup.resolved, camera, matrix, variance, batches, record), frames, stray, once)
+    batches = np.sqrt(shared)[None].astype(np.float32)
+    model = Model(setup.resolved, camera, matrix, variance, batches, record)
+    return RecordedCalibration(model, frames, unlit.stray, once)
 
 
 def _check_pixels_of_f(setup: Setup) -> None:
@@ -324,77 +339,95 @@ def _readings(scene: Scene, frames: RecordedFrames, value: float) -> FloatArray:
     return readings
 
 
-def _assign(
-    camera: Camera, positions: list[IntArray], files: list[Path], readings: FloatArray
-) -> tuple[RecordedEntries, StrayLight, int]:
-    """Assign readings, (exposures, M), to entries; also return the stray light and the number of lit readings of it."""
+def _nearest_sources(camera: Camera, positions: list[IntArray], files: list[Path]) -> IntArray:
+    """Pixel of f of the source that each reading is assigned to, (exposures, M), -1 beyond all footprints."""
     footprints = FootprintAssignment(camera, MARGIN)
-    assigned = [footprints.nearest_sources(where, file) for where, file in zip(positions, files, strict=True)]
-    outside = np.isfinite(readings)
-    for exposure, (pixel, _) in enumerate(assigned):
-        outside[exposure, pixel] = False
-    beyond = _stray_light(camera, readings, outside)
-    alone = np.array([len(of_exposure) == 1 for of_exposure in positions])
-    near = [np.full(pixel.size, exposure) for exposure, (pixel, _) in enumerate(assigned)]
-    source = np.array([of_exposure[0, 0] * camera.columns + of_exposure[0, 1] for of_exposure in positions])
-    far = _far_readings(outside & alone[:, None], source, beyond)
-    exposure = np.concatenate([*near, far[0]])
-    pixel = np.concatenate([*(pixel for pixel, _ in assigned), far[1]])
-    unknown = np.concatenate([*(unknown for _, unknown in assigned), source[far[0]]])
-    stray = int(np.sum(beyond.lit[~alone]))
-    return _entries(pixel, unknown, readings[exposure, pixel], camera.unknowns), beyond, stray
+    nearest = np.full((len(files), camera.measurements), -1, dtype=np.int64)
+    for of_exposure, where, file in zip(nearest, positions, files, strict=True):
+        pixel, unknown = footprints.nearest_sources(where, file)
+        of_exposure[pixel] = unknown
+    return nearest
 
 
-def _stray_light(camera: Camera, readings: FloatArray, outside: BoolArray) -> StrayLight:
-    mean_square, lit = np.empty(camera.measurements), np.zeros_like(outside)
-    slices = camera.slices()
-    for pixels in slices:
-        mean_square[pixels], limit = background(readings[:, pixels][outside[:, pixels]], CHANCE / len(slices))
-        lit[:, pixels] = outside[:, pixels] & (readings[:, pixels] > limit)
-    return StrayLight(mean_square, lit)
+def background(camera: Camera, readings: FloatArray, near: BoolArray, lone: IntArray, darks: float) -> Background:
+    """Tell readings without light from those that a source reaches, (exposures, M).
 
-
-def _far_readings(outside: BoolArray, source: IntArray, beyond: StrayLight) -> tuple[IntArray, IntArray]:
-    """Exposures and pixels where a source that was lit alone brought light outside its footprint: (n,) each.
-
-    If it was lit several times, all its readings of a pixel are used or none: selecting the largest would bias them.
+    near : True for readings in the footprint of a source;  lone : (exposures,) pixel of f of the only source, or -1
+    darks : number of dark frames, whose mean was subtracted; infinite if the dark level is known to be 0
     """
-    exposures, pixels = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    lit = beyond.lit & outside
-    for unknown in np.unique(source[lit.any(axis=1)]):
-        repeats = np.flatnonzero((source == unknown) & outside.any(axis=1))
-        used = np.flatnonzero(outside[repeats].all(axis=0) & (np.mean(lit[repeats], axis=0) > 0.5))
-        exposures.append(np.repeat(repeats, used.size))
-        pixels.append(np.tile(used, repeats.size))
-    return np.concatenate(exposures), np.concatenate(pixels)
+    single, alone = lone >= 0, np.flatnonzero(lone >= 0)
+    sweeps = sparse.csr_array((np.ones(alone.size), (lone[alone], alone)), shape=(camera.unknowns, lone.size))
+    score, window = _score(int(np.sum(np.isfinite(readings) & ~near))), np.ones((WIDTH, WIDTH, 1))
+
+    def around(values: FloatArray) -> FloatArray:
+        """Sum the readings of each lone source and its neighbours: (exposures, pixels) to (rows, columns, pixels)."""
+        of_source = np.asarray(sweeps @ values).reshape((*camera.shape, values.shape[1]))
+        return ndimage.convolve(of_source, window, mode="constant")
+
+    (levels, frames, variances), all_far, all_stray = np.zeros((3, camera.measurements)), near.copy(), near.copy()
+    for part in camera.slices():
+        values, finite = readings[:, part], np.isfinite(readings[:, part])
+        outside, count = finite & ~near[:, part], around(finite.astype(np.float64))
+        # Medians at first: a mean square would hide the light of a sub-image that lies beside all its footprints.
+        level = _median(values, outside)
+        variance, unlit = (_median(np.abs(values - level), outside) / MEDIAN_DEVIATION) ** 2, finite
+        for _ in range(ROUNDS):
+            limit, before = score * np.sqrt(np.maximum(variance, FAINTEST**2)), unlit
+            above = np.where(finite, values - level, 0.0)
+            lit = ndimage.maximum_filter(around(above) > limit * np.sqrt(count), window.shape, mode="constant")
+            far = lit.reshape(-1, level.size)[lone] & single[:, None] & ~near[:, part]
+            stray = outside & ~far & (above > limit)
+            unlit = outside & ~far & ~stray
+            number, dark = unlit.sum(axis=0), np.where(unlit, values, 0.0)
+            level = dark.sum(axis=0) / (darks + number)
+            squares = max(float(np.sum(np.square(dark) - level * dark)), 0.0)
+            variance = np.full(level.size, squares / number.sum() if number.any() else np.nan)
+            levels[part], frames[part], variances[part] = level, darks + number, variance
+            all_far[:, part], all_stray[:, part] = far, stray
+            if np.array_equal(unlit, before):
+                break
+    return Background(levels, frames, variances, all_far, int(np.sum(all_stray[~single])))
 
 
-def _entries(pixel: IntArray, unknown: IntArray, readings: FloatArray, unknowns: int) -> RecordedEntries:
-    """Group readings, (n,) each, of the same sensor pixel and pixel of f."""
-    keys, group = np.unique(pixel * unknowns + unknown, return_inverse=True)
-    alive = np.isfinite(readings)
-    group, readings = group[alive], readings[alive]
+def _median(values: FloatArray, used: BoolArray) -> FloatArray:
+    """Median over the exposures of the values used, 0 without any: (exposures, M) to (M,)."""
+    return np.asarray(cast(Any, np.ma).median(np.ma.array(values, mask=~used), axis=0).filled(0.0), dtype=np.float64)
+
+
+def _score(count: int) -> float:
+    """Standard deviations that one of `count` normal deviates exceeds with the probability CHANCE (Sidak)."""
+    return float(cast(Any, stats).norm.isf(-np.expm1(np.log1p(-CHANCE) / max(count, 1))))
+
+
+def _entries(unknown: IntArray, readings: FloatArray, unknowns: int) -> RecordedEntries:
+    """Group readings, (exposures, M), of the same sensor pixel and pixel of f; unknown : -1 for those not used."""
+    exposure, pixel = np.nonzero(unknown >= 0)
+    keys, group = np.unique(pixel * unknowns + unknown[exposure, pixel], return_inverse=True)
+    used = readings[exposure, pixel]
+    alive = np.isfinite(used)
+    group, used = group[alive], used[alive]
     count = np.bincount(group, minlength=keys.size)
-    mean = np.bincount(group, readings, keys.size) / np.maximum(count, 1)
-    squares = np.bincount(group, (readings - mean[group]) ** 2, keys.size)
+    mean = np.bincount(group, used, keys.size) / np.maximum(count, 1)
+    squares = np.bincount(group, (used - mean[group]) ** 2, keys.size)
     return RecordedEntries(keys // unknowns, keys % unknowns, mean, squares / np.maximum(count - 1, 1), count)
 
 
-def _variance(
-    camera: Camera, entries: RecordedEntries, beyond: StrayLight, step: FloatArray, photons: FloatArray
-) -> FloatArray:
-    """Variances of the entries: that of a reading over their count, or that of rounding if larger: (n,).
+def _variances(
+    camera: Camera, entries: RecordedEntries, unlit: Background, step: FloatArray, photons: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Variances of the entries and of the errors that those of a row share, (n,) each: of readings, or of rounding.
 
     The variance of a reading follows from repeats, or else from the background plus photon noise.
     step, photons : (M,) height of a digital number, and variance of photon noise per unit of light
     """
-    reading = beyond.mean_square[entries.pixel] + photons[entries.pixel] * np.maximum(entries.mean, 0.0)
+    dark, light = unlit.variance.copy(), photons.copy()
     for pixels in camera.type_slices():
-        of_type = (entries.pixel >= pixels.start) & (entries.pixel < pixels.stop)
-        repeated = of_type & (entries.count > 1)
+        repeated = (entries.pixel >= pixels.start) & (entries.pixel < pixels.stop) & (entries.count > 1)
         if repeated.any():
-            dark, light = photon_transfer(entries.mean[repeated], entries.variance[repeated], entries.count[repeated])
-            reading[of_type] = dark + light * np.maximum(entries.mean[of_type], 0.0)
+            dark[pixels], light[pixels] = photon_transfer(
+                entries.mean[repeated], entries.variance[repeated], entries.count[repeated]
+            )
+    reading = dark[entries.pixel] + light[entries.pixel] * np.maximum(entries.mean, 0.0)
     recorded = entries.count > 0
     if not np.isfinite(reading[recorded]).all():
         raise InputError(
@@ -404,7 +437,26 @@ def _variance(
     variance = np.full(reading.size, UNKNOWN_VARIANCE)
     rounded = rounding(reading[recorded], step[entries.pixel[recorded]])
     variance[recorded] = np.maximum(reading[recorded] / entries.count[recorded], rounded)
-    return variance
+    level = np.nan_to_num(dark / unlit.frames)[entries.pixel]
+    # Without noise to move them between steps, readings without light are rounded as their dark level is.
+    rounded = np.where(np.isfinite(unlit.frames), rounding(np.nan_to_num(dark), step), 0.0)[entries.pixel]
+    return variance, np.where(entries.mean > step[entries.pixel] / 2, np.maximum(level, rounded), level)
+
+
+def _check_seen(camera: Camera, entries: RecordedEntries, variance: FloatArray, starts: IntArray) -> None:
+    """Raise InputError for a sub-imager with pixels that work, of which no entry exceeds its noise."""
+    recorded = entries.count > 0
+    seen = recorded & (entries.mean > _score(int(recorded.sum())) * np.sqrt(variance))
+    parts = [
+        (sub.name, slice(*starts[[pixels.start, pixels.stop]]))
+        for sub, pixels in zip(camera.sub_imagers, camera.slices(), strict=True)
+    ]
+    blind = [name for name, part in parts if recorded[part].any() and not seen[part].any()]
+    if blind:
+        raise InputError(
+            "--points: expected light of the points in every sub-image, got noise alone in that of"
+            f" {named(blind)}; check --origin, --upright and the rotation of the sensor, and record one point per image"
+        )
 
 
 def photon_transfer(mean: FloatArray, variance: FloatArray, repeats: IntArray) -> tuple[float, float]:
@@ -431,31 +483,14 @@ def photon_transfer(mean: FloatArray, variance: FloatArray, repeats: IntArray) -
     return float(fit[0]), float(fit[1])
 
 
-def background(readings: FloatArray, chance: float) -> tuple[float, float]:
-    """Mean square of unlit readings, and the reading above which a pixel counts as lit.
-
-    chance : probability that at least one reading counts as lit if all are noise (Sidak); lit readings are left out of
-        the mean. Without readings the mean square is NaN and the limit infinite.
-    """
-    if not readings.size:
-        return float("nan"), float("inf")
-    score = float(cast(Any, stats).norm.isf(-np.expm1(np.log1p(-chance) / readings.size)))
-    dark = readings
-    for _ in range(ROUNDS):
-        limit = score * float(np.sqrt(np.mean(dark**2)))
-        kept = dark[dark <= limit]
-        if kept.size == dark.size or not kept.size:
-            break
-        dark = kept
-    mean_square = float(np.mean(dark**2))
-    return mean_square, score * mean_square**0.5
-
-
 def rounding(variance: FloatArray, step: FloatArray) -> FloatArray:
-    """Variance of rounding to multiples of `step` in the mean of any number of repeated readings.
+    """Variance of rounding to multiples of `step` in the mean of any number of repeated readings, an upper bound.
 
-    It is step^2 / 12 without noise; noise of `variance` moves readings between steps, so that rounding averages out:
-    the first harmonic of the sawtooth, and with it this variance, falls as exp(-4 pi^2 variance / step^2).
+    variance : of rounded readings
+    It is step^2 / 12 without noise; noise moves readings between steps, so that rounding averages out: the first
+    harmonic of the sawtooth, and with it this variance, falls as exp(-4 pi^2 noise / step^2). To the variance of
+    readings it adds what it no longer brings to their mean, at most pi^2 / 3 times the noise and step^2 / 12.
     """
-    noise = np.divide(variance, step**2, out=np.zeros_like(variance), where=step > 0)
+    rounded = np.divide(variance, step**2, out=np.zeros_like(variance), where=step > 0)
+    noise = np.maximum(rounded / (1 + np.pi**2 / 3), rounded - 1 / 12)
     return step**2 / 12 * np.exp(-4 * np.pi**2 * noise)

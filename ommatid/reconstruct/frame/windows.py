@@ -23,7 +23,8 @@ from .swept import swept_maps
 from .variance_map import VarianceMap, information, is_narrow, mean_ratios, moments, precision_map, prior_precision
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
-HALO, LONG_HALO = 8, 12  # pixels of f around it
+HALO, LONG_HALO = 8, 16  # pixels of f around it
+MOST_ENTRIES = 30_000_000  # of H of a part, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
 SIDE, WINDOWS = 28, 3  # pixels of f of a window that shows what the variation of kernels does; windows along each axis
 VARYING = 0.05  # variation of kernels from which windows count it; one of 0.09 makes a map 11 % wrong
@@ -76,7 +77,7 @@ class Windows:
     def frame(self, observation: Observation) -> VarianceMap:
         """Return the maps of a whole frame from the cores of windows side by side."""
         parts = [
-            part if isinstance(part, KernelFootprints) else Entries(part.to_sparse(), part.shape)
+            part if part.entries > MOST_ENTRIES else Entries(part.to_sparse(), part.shape)
             for part in observation.parts
         ]
         observation = Observation(observation.shape, tuple(parts))

@@ -357,14 +357,6 @@ class KernelFootprints(ObservationPart):
         shares = basis(positions, self.degree) @ self.coefficients.T
         return np.tensordot(shares, self.shapes.kernels, axes=1)
 
-    def kernels_at(self, row: float, columns: FloatArray) -> FloatArray:
-        """Return the kernels of footprints whose middles lie at places of f, in pixels, columns (n,): (n, W, W)."""
-        u, v = (
-            np.interp(place, np.sort(start) + self.places.width / 2, along[np.argsort(start)])
-            for place, start, along in zip((row, columns), self.places.starts, self.places.field, strict=True)
-        )
-        return self._kernels_at(np.stack([np.broadcast_to(u, v.shape), v], axis=1))
-
     def _chunked(self, pixels: IntArray, window: tuple[slice, slice] | None = None) -> sparse.csr_array:
         count = max(1, VALUES_AT_ONCE // self.places.width**2)
         chunks = (pixels[first : first + count] for first in range(0, max(pixels.size, 1), count))

@@ -36,7 +36,6 @@ LEAST = np.array([-1e6, -1e6, -0.99, -2 * pi, -1e6])  # of the numbers in a file
 MOST = np.array([1e6, 1e6, 99.0, 2 * pi, 1e6])
 ROW, COLUMN, MAGNIFICATION, ROTATION, K1 = range(COUNT)
 NEAR = 1e-3  # pixels of f, for derivatives of H: below the errors of views, above what rounding of areas shows
-ROUNDED = 1e-8  # of such a derivative
 
 
 def designed(sub: SubImager) -> FloatArray:
@@ -160,24 +159,21 @@ def slopes(camera: Camera, sub: SubImager, numbers: FloatArray) -> list[Observat
     They are differences of H itself, so that they are right within pixels of f and where the target ends: light that a
     footprint loses beside it changes with the shift. Raises as `entries` does.
     """
+
+    def slope(one: sparse.csr_array, other: sparse.csr_array) -> sparse.csr_array:
+        return sparse.csr_array((one - other) / (2 * NEAR))
+
     found = list[ObservationPart]()
     for number in (ROW, COLUMN):
         step = NEAR * (np.arange(COUNT) == number)
         ahead, behind = (part_of(camera, sub, numbers + sign * step) for sign in (1, -1))
         if isinstance(ahead, Entries) or isinstance(behind, Entries):
-            found.append(Entries(_slope(ahead.to_sparse(), behind.to_sparse()), camera.shape))
+            found.append(Entries(slope(ahead.to_sparse(), behind.to_sparse()), camera.shape))
         elif number == ROW:
-            found.append(replace(ahead, down=BoxAxis(_slope(ahead.down.shares, behind.down.shares))))
+            found.append(replace(ahead, down=BoxAxis(slope(ahead.down.shares, behind.down.shares))))
         else:
-            found.append(replace(ahead, across=BoxAxis(_slope(ahead.across.shares, behind.across.shares))))
+            found.append(replace(ahead, across=BoxAxis(slope(ahead.across.shares, behind.across.shares))))
     return found
-
-
-def _slope(ahead: sparse.csr_array, behind: sparse.csr_array) -> sparse.csr_array:
-    slope = sparse.csr_array((ahead - behind) / (2 * NEAR))
-    slope.data[np.abs(slope.data) < ROUNDED] = 0
-    slope.eliminate_zeros()
-    return slope
 
 
 def boxes_of(camera: Camera, lens_type: LensType, views: list[tuple[SubImager, FloatArray]]) -> list[Box]:

@@ -256,16 +256,16 @@ def _centroids(
 ) -> Centroids:
     """Return the moves of the centroids from the design, linear around these numbers."""
     light, expected = _expected(camera, sub, numbers, chart)
-    boxes = _designed_boxes(sub)
+    boxes, (starts, width) = _designed_boxes(sub), _intervals(camera, sub, numbers, chart)
     least = LEAST_LIGHT if boxes else 1 - LOST
-    kept = (light > least) & (chart.light > least)
-    slopes = [np.ones(kept.size)] * 2
-    if boxes:
-        slopes, even = _slopes(camera, sub, numbers, chart)
-        kept &= even
+    kept, slopes = (light > least) & (chart.light > least), np.ones((2, light.size))
+    for slope, start, size in zip(slopes, starts, camera.shape, strict=True):
+        for beyond in (-start, start + width - size) if boxes else ():
+            slope[beyond > 0] -= 0.5  # of a box that the target's edge cuts the other end alone moves
+            kept &= np.abs(beyond) > NEAR
     measured, scatter = chart.centroids(), chart.batch_centroids()
     design = np.concatenate(displacements(camera, sub, (chart.down, chart.across))) * units
-    design *= np.concatenate(slopes)[:, None]
+    design *= slopes.ravel()[:, None]
     both = np.tile(kept, 2)
     moved = np.concatenate([one - other for one, other in zip(measured, expected, strict=True)]) + design @ from_design
     count = len(scatter[0])
@@ -273,23 +273,6 @@ def _centroids(
     # A view that moves by less than m / 2 rays of all its pixels together moves none of them across an edge.
     unseen = (float(sub.type.ratio) / (2 * rays)) ** 2 / max(kept.sum(), 1)
     return Centroids(design[both], moved[both], variance[both], unseen)
-
-
-def _slopes(
-    camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows
-) -> tuple[list[FloatArray], BoolArray]:
-    """Return how far centroids move per pixel of f by which the view is shifted, down and across: (pixels,) each.
-
-    And which pixels do so evenly: one that ends at the target's edge moves less outwards than inwards. Footprints are
-    taken for boxes, of which the one end alone moves where the other lies beside the target.
-    """
-    slopes, even = list[FloatArray](), np.ones(chart.row.size, dtype=np.bool_)
-    starts, width = _intervals(camera, sub, numbers, chart)
-    for start, size in zip(starts, camera.shape, strict=True):
-        beyond = -start, start + width - size
-        slopes.append(1 - np.sum([each > 0 for each in beyond], axis=0) / 2)
-        even &= np.all([np.abs(each) > NEAR for each in beyond], axis=0)
-    return slopes, even
 
 
 def solve(problems: list[Centroids], structure: Structure) -> ViewSolution:

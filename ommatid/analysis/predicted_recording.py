@@ -16,6 +16,7 @@ from ommatid.reconstruct.prior_fit import fit_picture, natural_prior
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, derived_seed, stream
+from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
@@ -74,9 +75,10 @@ def predicted_recording(setup: Setup) -> PredictedRecording:
     coarse = _with_own_seed(setup)
     setup = coarse.calibrated
     truth, said = known_image(setup)
-    image = _prior_draw(setup) if truth is None else truth
+    world = coarse.world.image if truth is not None else _prior_draw(coarse.world).reshape(coarse.world.camera.shape)
+    image = averaged(world, world.shape[0] // setup.camera.rows).ravel() if truth is None else truth
     camera = _camera(setup)
-    variance, said_of_light = _rendering_variance(setup, camera, image)
+    variance, said_of_light = _rendering_variance(coarse, camera, image, world.ravel())
     rng = stream(setup.scene.render.seed, Purpose.PREDICTED_LIGHT)
     light = camera.model.forward(image)
     light = light + rng.normal(size=light.size) * np.sqrt(variance)
@@ -195,15 +197,24 @@ def _calibrated(setup: Setup, camera: _Camera, stack: Stack) -> tuple[Model, Ass
     return pilot.with_errors(model, rng), said
 
 
-def _rendering_variance(setup: Setup, camera: _Camera, image: FloatArray) -> tuple[FloatArray, Assumptions]:
-    """Return the variance of the rendered light, (M,)."""
-    scene, plans = setup.scene, pilot.rendering_plans(setup)
-    same = camera.pilot is not None and plans == pilot.calibration_plans(setup)
-    traced = camera.pilot if same and camera.pilot is not None else pilot.pilot(setup, plans)
+def _rendering_variance(
+    setup: Setup, camera: _Camera, image: FloatArray, world: FloatArray
+) -> tuple[FloatArray, Assumptions]:
+    """Return the variance of the rendered light, (M,).
+
+    setup : on the grid of f;  image : on that of H's columns;  world : on that of what is rendered
+    """
+    scene, plans, setup, rendered = setup.scene, pilot.rendering_plans(setup), setup.calibrated, setup.world
     light = camera.model.forward(image)
     floor = rounding_variance(light, max(work.samples for work in plans.values()))
-    variance = np.maximum(traced.rendering_variance(image), floor)
-    said = _extrapolation("the rendering", traced.extrapolated)
+    if scene.world is not None:
+        variance, extrapolated = pilot.world_variance(rendered, plans)
+    else:
+        same = image.size == world.size and plans == pilot.calibration_plans(setup)
+        traced = camera.pilot if same and camera.pilot is not None else pilot.pilot(rendered, plans)
+        variance, extrapolated = traced.rendering_variance(world), traced.extrapolated
+    variance = np.maximum(variance, floor)
+    said = _extrapolation("the rendering", extrapolated)
     if scene.render.samples != "auto":
         return variance, said
     check_noise_target(scene)

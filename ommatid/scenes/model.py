@@ -20,7 +20,7 @@ from ommatid.runtime.errors import InputError
 
 from .camera import Camera
 from .constants import MOST_DENSE
-from .fitted.fitted_matrix import Directions, FittedMatrix, gradient
+from .fitted.fitted_matrix import Directions, FittedMatrix
 from .observation import Entries, Observation, ObservationPart
 from .optics.boxes import Box, designed_box
 from .scene import Scene
@@ -166,15 +166,7 @@ class Model:
 
     def errors(self, image: FloatArray) -> Directions | None:
         """Return the errors of H f by those of few numbers, None where H does not follow from such."""
-        fitted = self.fitted
-        if fitted is None or not fitted.has_errors:
-            return None
-        return fitted.errors(image, lambda: self._gradients(image))
-
-    def _gradients(self, image: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """H applied to the gradient of f, (N,), down and across: (M,) each."""
-        down, across = gradient(image, self.camera.shape)
-        return self.forward(down), self.forward(across)
+        return self.fitted.errors(image) if self.fitted is not None and self.fitted.has_errors else None
 
     def variance_from_model(self, image: FloatArray, noise: Sequence[FloatArray] = ()) -> FloatArray:
         """Variance that the uncertainty of H adds to each measurement of `image`: (M,).

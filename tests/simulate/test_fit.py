@@ -121,6 +121,18 @@ def test_h_is_far_better_known_than_entry_by_entry(wrong: dict[str, Any], share:
     assert fit.matrix.is_as_designed == (not wrong)
 
 
+def test_pixels_that_lose_light_count_in_rotated_views() -> None:
+    """Outer pixels of all four sub-imagers see past the target: without them five and fewer of nine remain."""
+    rotated = {"tolerance": {"position": "0.3 um", "rotation": "1 deg", "seed": 1}}
+    _, pinholes = with_optics({}, rotated, (("1/5", [2, 2], [3, 3]),), (16, 16))
+    true = true_matrix(pinholes)
+    assert true.sum(axis=1).min() < 0.9
+    for seed in range(8):
+        fit = drawn(pinholes, true, RAYS, seed)
+        assert not fit.record["refused"]
+        assert rms_error(fit.matrix.to_sparse(), true) < 0.2 * rms_error(fit.responses.matrix, true)
+
+
 def test_what_no_view_explains_is_measured_entry_by_entry() -> None:
     """A blur of one pixel of f in one lens type is no view; the other type's views still explain it."""
     cam = camera((19, 19), THREE[:2])

@@ -1,14 +1,15 @@
 """H of a calibrated camera by few numbers: views of sharp lens types, kernels of blurred ones, entries of the rest.
 
 The errors of the numbers are errors of all pixels of a sub-imager, or of a lens type, together: they do not average out
-over pixels. To first order a displaced view reads H f' along the displacement, with f' the gradient of f.
+over pixels. To first order the readings of a displaced pixel change as those of its view do when that is shifted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from typing import Any
 
@@ -16,14 +17,15 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.runtime.machine import processors
 
 from ..camera import Camera
 from ..lens_type import LensType, SubImager
-from ..observation import Observation, ObservationPart
+from ..observation import Observation, ObservationPart, Seen
 from ..tables.table import LARGEST
 from .kernel_shapes import Numbers
 from .kernels import KernelFootprints
-from .view import COUNT, K1, LEAST, MOST, ROTATION, boxes_of, designed, displacements, entries, real_box
+from .view import COUNT, K1, LEAST, MOST, ROTATION, boxes_of, designed, displacements, part_of, slopes
 
 STRUCTURES = {"own", "shared", "designed"}
 ALIKE = 0.05  # pixels of f that views may be displaced by where error maps take H as designed
@@ -209,12 +211,9 @@ class FittedMatrix:
         return sparse.csr_array(sparse.vstack(parts, format="csr"))
 
     def _rows(self, sub: SubImager, numbers: FloatArray) -> sparse.csr_array:
-        if numbers[ROTATION] == 0 and numbers[K1] == 0 and not sub.rotation and sub.type.optics.distortion is None:
-            box = real_box(self.camera.shape, sub, numbers)
-            rows = sparse.csr_array(sparse.kron(box.down.shares, box.across.shares, format="csr"))
-            rows.eliminate_zeros()
-            return rows
-        return entries(self.camera, sub, numbers)
+        rows = part_of(self.camera, sub, numbers).to_sparse()
+        rows.eliminate_zeros()
+        return rows
 
     def _no_rows(self, sub: SubImager) -> sparse.csr_array:
         return sparse.csr_array((sub.type.pixels[0] * sub.type.pixels[1], self.camera.unknowns))
@@ -234,44 +233,43 @@ class FittedMatrix:
         }
         return FittedMatrix(self.camera, views, {name: each.without_errors for name, each in self.kernels.items()})
 
-    def errors(self, image: FloatArray, gradients: Callable[[], tuple[FloatArray, FloatArray]]) -> Directions:
-        """Return the errors of H f; gradients : to H f' down and across, (M,) each, which views need."""
-        return Directions(self.camera.measurements, lambda: self._directions(image, gradients))
+    def errors(self, image: FloatArray) -> Directions:
+        """Return the errors of H f."""
+        return Directions(self.camera.measurements, lambda: self._directions(image))
 
-    def _directions(
-        self, image: FloatArray, gradients: Callable[[], tuple[FloatArray, FloatArray]]
-    ) -> Iterator[tuple[slice, Block]]:
+    def _directions(self, image: FloatArray) -> Iterator[tuple[slice, Block]]:
         """Yield the measurements of each lens type, and its block of L: what its sub-imagers share, then their own."""
-        of_views = None
+        seen = Seen(np.ascontiguousarray(image, dtype=np.float64).reshape(self.camera.shape), self.camera.shape)
         for lens, views, subs, slices in self._types:
             measurements = slice(slices[0].start, slices[-1].stop)
             if lens.name in self.kernels:
                 yield measurements, self.kernels[lens.name].error_directions(image)
                 continue
-            of_views = of_views or gradients()
-            moves = [self._moves(sub, of_views, place) for sub, place in zip(subs, slices, strict=True)]
+            moves = [self._moves(sub, seen, *parts) for sub, parts in zip(subs, self._slopes[lens.name], strict=True)]
             shared, own = (
                 [sparse.csc_array(move @ factor) for move, factor in zip(moves, factors, strict=True)]
                 for factors in (views.shared, views.own)
             )
             yield measurements, sparse.csc_array(sparse.hstack([sparse.vstack(shared), sparse.block_diag(own)]))
 
-    def _moves(self, sub: SubImager, gradients: tuple[FloatArray, FloatArray], place: slice) -> FloatArray:
+    @cached_property
+    def _slopes(self) -> dict[str, list[list[ObservationPart]]]:
+        """The slopes of H of every sub-imager of each lens type that views describe."""
+        with ThreadPoolExecutor(processors()) as threads:
+            return {
+                lens.name: list(threads.map(partial(slopes, self.camera), subs, views.numbers))
+                for lens, views, subs, _ in self._types
+                if lens.name not in self.kernels
+            }
+
+    def _moves(self, sub: SubImager, seen: Seen, down: ObservationPart, across: ObservationPart) -> FloatArray:
         """Return the change of a sub-imager's readings per unit of each number: (pixels, 5)."""
         index = np.indices(sub.type.pixels).reshape(2, -1).astype(np.float64)
-        rows, columns = displacements(self.camera, sub, (index[0], index[1]))
-        return gradients[0][place, None] * rows + gradients[1][place, None] * columns
-
-
-def gradient(image: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Return the derivative of f, (N,), down and across; beyond the target f is 0: (N,) each.
-
-    Averaged over a box of whole pixels the central difference is exactly the mean of the derivatives to both sides.
-    """
-    around = np.pad(np.asarray(image, dtype=np.float64).reshape(shape), 1)
-    down = (around[2:, 1:-1] - around[:-2, 1:-1]) / 2
-    across = (around[1:-1, 2:] - around[1:-1, :-2]) / 2
-    return down.ravel(), across.ravel()
+        moves, change = np.zeros((index.shape[1], COUNT)), np.empty(index.shape[1])
+        for part, displaced in zip((down, across), displacements(self.camera, sub, (index[0], index[1])), strict=True):
+            part.forward(seen, change)
+            moves += change[:, None] * displaced
+        return moves
 
 
 def designed_views(subs: list[SubImager]) -> FloatArray:

@@ -20,6 +20,7 @@ from ommatid.runtime.arrays import FloatArray
 
 from ..camera import Camera
 from ..lens_type import LensOptics, LensType, SubImager
+from ..observation import Entries, ObservationPart
 from ..optics.boxes import Box, BoxAxis, designed_box
 from ..pose import Misalignment, pose_of
 
@@ -34,6 +35,7 @@ COUNT = len(UNITS)
 LEAST = np.array([-1e6, -1e6, -0.99, -2 * pi, -1e6])  # of the numbers in a file
 MOST = np.array([1e6, 1e6, 99.0, 2 * pi, 1e6])
 ROW, COLUMN, MAGNIFICATION, ROTATION, K1 = range(COUNT)
+NEAR = 1e-3  # pixels of f, for derivatives of H: below the errors of views, above what rounding of areas shows
 
 
 def designed(sub: SubImager) -> FloatArray:
@@ -143,6 +145,35 @@ def real_box(shape: tuple[int, int], sub: SubImager, numbers: FloatArray) -> Box
         for pixels, centre, number, size in zip(sub.type.pixels, middle, (ROW, COLUMN), shape, strict=True)
     ]
     return Box(alone, *axes)
+
+
+def part_of(camera: Camera, sub: SubImager, numbers: FloatArray) -> Box | Entries:
+    """H of a sub-imager: a box where its footprints are boxes, else entries. Raises as `entries` does."""
+    turned = numbers[ROTATION] or numbers[K1] or sub.rotation or sub.type.optics.distortion is not None
+    return Entries(entries(camera, sub, numbers), camera.shape) if turned else real_box(camera.shape, sub, numbers)
+
+
+def slopes(camera: Camera, sub: SubImager, numbers: FloatArray) -> list[ObservationPart]:
+    """Return the changes of H of a sub-imager per pixel of f by which its view is shifted, down and across.
+
+    They are differences of H itself, so that they are right within pixels of f and where the target ends: light that a
+    footprint loses beside it changes with the shift. Raises as `entries` does.
+    """
+
+    def slope(one: sparse.csr_array, other: sparse.csr_array) -> sparse.csr_array:
+        return sparse.csr_array((one - other) / (2 * NEAR))
+
+    found = list[ObservationPart]()
+    for number in (ROW, COLUMN):
+        step = NEAR * (np.arange(COUNT) == number)
+        ahead, behind = (part_of(camera, sub, numbers + sign * step) for sign in (1, -1))
+        if isinstance(ahead, Entries) or isinstance(behind, Entries):
+            found.append(Entries(slope(ahead.to_sparse(), behind.to_sparse()), camera.shape))
+        elif number == ROW:
+            found.append(replace(ahead, down=BoxAxis(slope(ahead.down.shares, behind.down.shares))))
+        else:
+            found.append(replace(ahead, across=BoxAxis(slope(ahead.across.shares, behind.across.shares))))
+    return found
 
 
 def boxes_of(camera: Camera, lens_type: LensType, views: list[tuple[SubImager, FloatArray]]) -> list[Box]:

@@ -7,7 +7,10 @@ luminous efficiency of 1924 and K_m = 683.002 lm/W. (The SI fixes 683 lm/W at 54
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
+from math import inf
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +23,8 @@ from ommatid.runtime.errors import InputError
 from ..constants import GREEN
 from ..formats.curve import Curve, read_curve
 from ..scene import Scene
-from ..tables.camera import RAYS
+from ..tables.camera import RAYS, LensTable, Surface
+from ..tables.glass import index_behind
 from ..tables.sensor import MILLIMETRE
 
 PLANCK, LIGHT_SPEED = 6.62607015e-34, 299792458.0  # J s, m/s: exact in the SI
@@ -29,7 +33,7 @@ METRES = 1e-9  # per nm
 STEP, FEWEST = 0.5, 65  # nm between the points of an integral over a spectrum, and points at least
 TOLERANCE = 1e-3  # of the contrast that a diffracting lens transfers, at every spatial frequency
 MOST_WAVELENGTHS = 12
-FREQUENCIES = 200
+FREQUENCIES, POINTS = 64, 24  # of spatial frequency, and of the integral over the pupil
 
 Bands = tuple[tuple[float, float], ...]
 
@@ -126,7 +130,8 @@ def wavelengths_of(scene: Scene) -> tuple[float | None, Bands]:
     Without any description of the light it is 550 nm for lenses with a width, and rays for pinholes.
 
     bands : wavelengths in mm and the share of electrons that each stands for, nodes of Gauss's rule, as few as change
-        the contrast of a perfect diffracting lens by less than 1e-3 at any spatial frequency
+        the contrast of a perfect diffracting lens, with and without the axial colour of each lens type, by less than
+        1e-3 at any spatial frequency
     Raises InputError if none of the light is detected.
     """
     if scene.light is None:
@@ -144,28 +149,81 @@ def wavelengths_of(scene: Scene) -> tuple[float | None, Bands]:
             f"{scene.source}: sensor.quantum_efficiency: expected a curve above 0 within the light's"
             f" {wavelength[0]:g} to {wavelength[-1]:g} nm, got none; extend it"
         )
-    at, share = nodes(wavelength, electrons)
+    middle = float(wavelength @ electrons / electrons.sum())
+    at, share = nodes(wavelength, electrons, [_defocus(scene, lens, wavelength, middle) for lens in scene.camera.lens])
     bands = tuple((float(node) / MILLIMETRE, float(part)) for node, part in zip(at, share, strict=True))
     return float(at @ share) / MILLIMETRE, bands if len(bands) > 1 else ()
 
 
-def nodes(wavelength: FloatArray, weight: FloatArray, tolerance: float = TOLERANCE) -> tuple[FloatArray, FloatArray]:
-    """Nodes and weights, of sum 1, of the smallest of Gauss's rules that keeps the contrast within a tolerance."""
+def _defocus(scene: Scene, lens: LensTable, wavelength: FloatArray, middle: float) -> FloatArray:
+    """Return the defocus, (n,), in waves at the rim of the pupil, at wavelengths in nm, of a lens in focus at one.
+
+    By paraxial rays, 0 without surfaces. A glass whose index is unknown at a wavelength has that of the nearest one.
+    """
+    if lens.surfaces is None or isinstance(lens.surfaces, str):
+        return np.zeros(wavelength.size)
+    found = list[tuple[float, float, float]]()
+    for place in map(float, np.linspace(float(wavelength[0]), float(wavelength[-1]), FEWEST)):
+        with suppress(InputError):  # a range of measured indices that ends, or an unknown glass, refused elsewhere
+            found.append((place, *_power(lens.surfaces, place / MILLIMETRE)))
+    at, powers, radii = np.array(found).reshape(-1, 3).T
+    power = np.interp(middle, at, powers) if at.size else 0.0
+    if power <= 0:
+        return np.zeros(wavelength.size)
+    pitches = scene.target.pixel_pitch / (scene.camera.pixel_pitch * float(lens.magnification))
+    scale = lens.scale if isinstance(lens.scale, float) else power * scene.target.distance / (1 + pitches)
+    return radii[0] ** 2 * scale * (np.interp(wavelength, at, powers) - power) / (2 * wavelength / MILLIMETRE)
+
+
+def _power(surfaces: Sequence[Surface], wavelength: float) -> tuple[float, float]:
+    """Return 1 / focal length of surfaces, and the radius of the entrance pupil, by a ray that enters at height 1.
+
+    Raises InputError for an index that is unknown at the wavelength, in mm.
+    """
+    height, slope, before, radii = 1.0, 0.0, 1.0, list[float]()
+    for surface in surfaces:
+        radii.append(surface.semi_diameter / max(abs(height), 1e-30))
+        index = index_behind(surface, wavelength)
+        slope -= height * (index - before) / (surface.radius or inf)
+        height += (surface.thickness or 0.0) / index * slope
+        before = index
+    marked = [radius for radius, surface in zip(radii, surfaces, strict=True) if surface.stop]
+    return -slope, min(marked or radii)
+
+
+def nodes(
+    wavelength: FloatArray, weight: FloatArray, defocus: Sequence[FloatArray], tolerance: float = TOLERANCE
+) -> tuple[FloatArray, FloatArray]:
+    """Nodes and weights, of sum 1, of the smallest of Gauss's rules that keeps the contrast within a tolerance.
+
+    defocus : of each lens at the wavelengths, (n,) in waves;  a lens without any is one more
+    """
+    waves = {tuple(each[weight > 0].tolist()) for each in (np.zeros(wavelength.size), *defocus)}
     wavelength, weight = wavelength[weight > 0], weight[weight > 0] / weight.sum()
     frequency: FloatArray = np.linspace(0.0, 1.0 / float(wavelength[0]), FREQUENCIES)[:, None]
-    exact = _contrast(frequency * wavelength) @ weight
+    exact = [_contrast(frequency * wavelength, np.array(row)) @ weight for row in waves]
     at, share = gauss(wavelength, weight, 1)
     for count in range(2, MOST_WAVELENGTHS + 1):
-        if np.abs(_contrast(frequency * at) @ share - exact).max() < tolerance:
+        few = (_contrast(frequency * at, np.interp(at, wavelength, row)) @ share for row in waves)
+        if all(np.abs(one - other).max() < tolerance for one, other in zip(few, exact, strict=True)):
             break
         at, share = gauss(wavelength, weight, count)
     return at, share
 
 
-def _contrast(frequency: FloatArray) -> FloatArray:
-    """Contrast that an aberration-free circular pupil transfers, by frequency in units of its cut-off."""
+def _contrast(frequency: FloatArray, waves: FloatArray) -> FloatArray:
+    """Contrast that a circular pupil transfers, by frequency in units of its cut-off, (n, m), and by defocus, (m,).
+
+    4 / pi times the integral of cos^2 a cos(8 pi W s (sin a - s)) over a from arcsin s to pi / 2 (Hopkins 1955,
+    Proc. R. Soc. A 231, 91): with x = sin a - s, half the pupils displaced by s overlap by cos a at x.
+    """
     inside = np.minimum(frequency, 1.0)
-    return 2 / np.pi * (np.arccos(inside) - inside * np.sqrt(1 - inside * inside))
+    least = np.arcsin(inside)
+    half, total = (np.pi / 2 - least) / 2, np.zeros_like(inside)
+    for node, share in zip(*legendre.leggauss(POINTS), strict=True):
+        angle = least + half * (1 + node)
+        total += share * np.square(np.cos(angle)) * np.cos(8 * np.pi * waves * inside * (np.sin(angle) - inside))
+    return 4 / np.pi * half * total
 
 
 def gauss(points: FloatArray, weight: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:

@@ -3,7 +3,8 @@
 Rays are traced as for a calibration by transport, with seeds that neither data nor calibration uses, on the same grids
 of samples but in fewer passes: what n passes leave is 1/n of the variance of one. Where that is still too much work the
 grids are smaller, and variances are extrapolated. A rendering with as many samples has the same law as a calibration:
-the reading of a pass is the row of H of that pass, applied to the picture.
+the reading of a pass is the row of H of that pass, applied to the picture. A world with depth has no such rows: its
+light is rendered, with half the passes.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
+from ..render import light
 from ..renderer.variant import choose, unusable_reason
 from ..sampling.passes import BATCHES, Plan, plan
 from ..sampling.samplers import expected_exponent, fitting
@@ -149,12 +151,31 @@ def pilot(setup: Setup, plans: Plans) -> Pilot:
     model = rendered_model(changed, plans=traced, float64=scene.calibration.samples == "auto")
     pinholes = all(lens.optics.aperture is None and lens.optics.surfaces is None for lens in setup.simulated.types)
     exponent = expected_exponent(scene.render.sampler) if pinholes else 1.0
-    rows = np.empty(setup.camera.measurements)
-    for lens_type, pixels in zip(setup.camera.types, setup.camera.type_slices(), strict=True):
+    return Pilot(model, *_factor(setup.camera, traced, plans, exponent))
+
+
+def world_variance(setup: Setup, plans: Plans) -> tuple[FloatArray, bool]:
+    """Return the variance of a rendering of the scene's world, (M,), with the samples of `plans`, from half the passes.
+
+    And True if it follows from fewer samples per pass. Paths through a world scatter as independent rays do. Raises
+    InputError as `setup_of_pilot` does, or where the world cannot be built.
+    """
+    few = min(_affordable(setup, plans).values(), key=lambda work: work.samples)
+    few = Plan(BATCHES, few.samples)
+    changed = setup_of_pilot(setup)
+    render = changed.scene.render.model_copy(update={"samples": few.total})
+    rendering = light(replace(changed, scene=with_tables(changed.scene, render=render)), work=few)
+    factor, extrapolated = _factor(setup.camera, dict.fromkeys(plans, few), plans, 1.0)
+    return factor * rendering.stated_variance(setup.camera), extrapolated
+
+
+def _factor(camera: Camera, traced: Plans, plans: Plans, exponent: float) -> tuple[FloatArray, bool]:
+    """Return the variances with the samples of `plans` over those of `traced`, (M,), and True if samples differ."""
+    rows = np.empty(camera.measurements)
+    for lens_type, pixels in zip(camera.types, camera.type_slices(), strict=True):
         few, all_ = traced[lens_type.name], plans[lens_type.name]
         rows[pixels] = few.passes / all_.passes * (few.samples / all_.samples) ** exponent
-    extrapolated = any(traced[name].samples < work.samples for name, work in plans.items())
-    return Pilot(model, rows, extrapolated)
+    return rows, any(traced[name].samples < work.samples for name, work in plans.items())
 
 
 def _fast_variant(requested: str) -> str:

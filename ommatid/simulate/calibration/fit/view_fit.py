@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import sparse, stats
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.scenes.camera import Camera
@@ -34,16 +34,15 @@ from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.shrinkage import shrink_variances
 
 from ...sampling.passes import BATCHES
-from .chart import ChartRows, centroids
+from .chart import ChartRows
 
 STRAIGHT = 1e-4  # rad, and relative of k1: below, footprints are boxes to within 0.1 ray of 1024
 SIGNIFICANCE = 0.01  # of all tests of a kind together, at which a correct model is rejected
 STEPS = 12  # of Gauss and Newton; 2 but where views are displaced by more than a pixel of f, or rotated
 SETTLED = 0.01  # of a ray's share of a centroid, below which another step changes nothing
 LEAST_LIGHT = 0.3  # of a pixel's rays that have to meet the target for its centroid to be used, and
-LOST = 0.02  # of them that may miss it where footprints are no boxes
-NEAR = 0.05  # pixels of f, for the derivatives of centroids: 1 of a pixel seen as a whole, less at the target's edge
-ROUNDED = 1e-9  # of a pixel's light
+LOST = 0.02  # of them that may miss it where footprints are no boxes as designed
+NEAR = 0.05  # pixels of f from the target's edge to that of a footprint, within which centroids move unevenly
 REDUCTIONS = (
     ((K1,), "designed"),
     ((ROTATION,), "shared"),
@@ -63,24 +62,36 @@ def predicted(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartR
 
 def has_boxes(sub: SubImager, numbers: FloatArray) -> bool:
     """Return True if all footprints of a view are boxes, or nearly so."""
-    straight = abs(numbers[ROTATION]) <= STRAIGHT and abs(numbers[K1]) <= STRAIGHT
-    return straight and not sub.rotation and sub.type.optics.distortion is None
+    return abs(numbers[ROTATION]) <= STRAIGHT and abs(numbers[K1]) <= STRAIGHT and _designed_boxes(sub)
+
+
+def _designed_boxes(sub: SubImager) -> bool:
+    """Return True if all footprints of a view are boxes as designed."""
+    return not sub.rotation and sub.type.optics.distortion is None
 
 
 def _boxes(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> FloatArray:
     """Take every footprint for a box, displaced as its middle is by rotation and distortion."""
+    starts, width = _intervals(camera, sub, numbers, chart)
+    shares = [
+        _overlap(start, width, first, size)
+        for start, first, size in zip(starts, (chart.row, chart.column), chart.values.shape[1:], strict=True)
+    ]
+    return shares[0][:, :, None] * shares[1][:, None, :]
+
+
+def _intervals(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> tuple[list[FloatArray], float]:
+    """Return where these boxes begin, in rows and in columns of f, (pixels,) each, and their width."""
     down, across = offsets(sub, (chart.down, chart.across))
     moved = (numbers - designed(sub)) * (np.arange(numbers.size) != MAGNIFICATION)
     rows, columns = (each @ moved for each in displacements(camera, sub, (chart.down, chart.across)))
     growth = 1 + float(numbers[MAGNIFICATION])
     middle, width = sub.type.middle(sub.window), float(sub.type.ratio) / growth
-    shares = [
-        _overlap(centre + offset / growth + move - width / 2, width, first, size)
-        for centre, offset, move, first, size in zip(
-            middle, (down, across), (rows, columns), (chart.row, chart.column), chart.values.shape[1:], strict=True
-        )
+    starts = [
+        centre + offset / growth + move - width / 2
+        for centre, offset, move in zip(middle, (down, across), (rows, columns), strict=True)
     ]
-    return shares[0][:, :, None] * shares[1][:, None, :]
+    return starts, width
 
 
 def _overlap(start: FloatArray, width: float, first: IntArray, size: int) -> FloatArray:
@@ -92,15 +103,35 @@ def _overlap(start: FloatArray, width: float, first: IntArray, size: int) -> Flo
 
 def _exact(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> FloatArray:
     """Take the exact areas of overlap."""
-    pixels = (chart.down * sub.type.pixels[1] + chart.across).astype(np.int64)
-    rows = entries(camera, sub, numbers)[pixels]
-    cells = np.repeat(np.arange(pixels.size), np.diff(rows.indptr))
+    rows = _rows(camera, sub, numbers, chart)
+    cells = np.repeat(np.arange(chart.row.size), np.diff(rows.indptr))
     row, column = np.divmod(rows.indices.astype(np.int64), camera.columns)
     row, column = row - chart.row[cells], column - chart.column[cells]
     values = np.zeros_like(chart.values)
     inside = (row >= 0) & (row < values.shape[1]) & (column >= 0) & (column < values.shape[2])
     values[cells[inside], row[inside], column[inside]] = rows.data[inside]
     return values
+
+
+def _rows(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> sparse.csr_array:
+    """Return the exact rows of H of the chart's pixels: (pixels, N)."""
+    return entries(camera, sub, numbers)[(chart.down * sub.type.pixels[1] + chart.across).astype(np.int64)]
+
+
+def _expected(
+    camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the light and the centroids of the chart's pixels, (pixels,) each, also outside the chart's windows."""
+    if has_boxes(sub, numbers):
+        starts, width = _intervals(camera, sub, numbers, chart)
+        pairs = zip(starts, camera.shape, strict=True)
+        ends = [(np.maximum(start, 0), np.minimum(start + width, size)) for start, size in pairs]
+        down, across = (np.maximum(last - first, 0) / width for first, last in ends)
+        return down * across, [(first + last) / 2 for first, last in ends]
+    rows = _rows(camera, sub, numbers, chart)
+    light = rows @ np.ones(camera.unknowns)
+    places = np.divmod(np.arange(camera.unknowns), camera.columns)
+    return light, [rows @ (place + 0.5) / np.maximum(light, np.finfo(float).tiny) for place in places]
 
 
 @dataclass(frozen=True)
@@ -224,18 +255,17 @@ def _centroids(
     from_design: FloatArray,
 ) -> Centroids:
     """Return the moves of the centroids from the design, linear around these numbers."""
-    model = predicted(camera, sub, numbers, chart)
-    boxes = has_boxes(sub, numbers)
+    light, expected = _expected(camera, sub, numbers, chart)
+    boxes, (starts, width) = _designed_boxes(sub), _intervals(camera, sub, numbers, chart)
     least = LEAST_LIGHT if boxes else 1 - LOST
-    kept = (model.sum(axis=(1, 2)) > least) & (chart.light > least)
-    expected = centroids(model, chart.row, chart.column)
-    slopes = [np.ones(kept.size)] * 2
-    if boxes:
-        slopes, even = _slopes(camera, sub, numbers, chart)
-        kept &= even
+    kept, slopes = (light > least) & (chart.light > least), np.ones((2, light.size))
+    for slope, start, size in zip(slopes, starts, camera.shape, strict=True):
+        for beyond in (-start, start + width - size) if boxes else ():
+            slope[beyond > 0] -= 0.5  # of a box that the target's edge cuts the other end alone moves
+            kept &= np.abs(beyond) > NEAR
     measured, scatter = chart.centroids(), chart.batch_centroids()
     design = np.concatenate(displacements(camera, sub, (chart.down, chart.across))) * units
-    design *= np.concatenate(slopes)[:, None]
+    design *= slopes.ravel()[:, None]
     both = np.tile(kept, 2)
     moved = np.concatenate([one - other for one, other in zip(measured, expected, strict=True)]) + design @ from_design
     count = len(scatter[0])
@@ -243,24 +273,6 @@ def _centroids(
     # A view that moves by less than m / 2 rays of all its pixels together moves none of them across an edge.
     unseen = (float(sub.type.ratio) / (2 * rays)) ** 2 / max(kept.sum(), 1)
     return Centroids(design[both], moved[both], variance[both], unseen)
-
-
-def _slopes(
-    camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows
-) -> tuple[list[FloatArray], BoolArray]:
-    """Return how far centroids move per pixel of f by which the view is shifted, down and across: (pixels,) each.
-
-    And which pixels do so evenly: one that ends at the target's edge moves less outwards than inwards.
-    """
-    slopes, even = list[FloatArray](), np.ones(len(chart.row), dtype=np.bool_)
-    for axis in (ROW, COLUMN):
-        shift = NEAR * (np.arange(COUNT) == axis)
-        ahead, behind = (predicted(camera, sub, numbers + sign * shift, chart) for sign in (1, -1))
-        moved = [centroids(each, chart.row, chart.column)[axis] for each in (ahead, behind)]
-        slopes.append((moved[0] - moved[1]) / (2 * NEAR))
-        whole = [each.sum(axis=(1, 2)) > 1 - ROUNDED for each in (ahead, behind)]
-        even &= whole[0] == whole[1]
-    return slopes, even
 
 
 def solve(problems: list[Centroids], structure: Structure) -> ViewSolution:

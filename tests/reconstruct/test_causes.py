@@ -142,7 +142,11 @@ MADE: dict[str, tuple[str, str, dict[str, Any]]] = {  # to the cause, what a sen
     "gains": ("gain", "others in other sub-imagers", {"change": gains}),
     "whole type": ("gain", "a gain of 1.1 in lens type A", {"change": changed(lambda v: 1.1 * v, first_type)}),
     "offset": ("offset", "levels in sub-imager (2, 1) of type B", {"change": changed(lambda v: 8.0 + v)}),
-    "shift": ("shift", "0.51 pixels of f down", {"view": moved(one, lambda y, x: (y + 0.5, x - 0.3))}),
+    "shift": (
+        "shift",
+        "0.51 pixels of f too far down and 0.27 left",
+        {"view": moved(one, lambda y, x: (y + 0.5, x - 0.3))},
+    ),
     "rotation": (
         "rotation",
         "4.4 degrees in lens type A",

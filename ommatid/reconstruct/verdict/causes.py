@@ -64,7 +64,7 @@ CAUSES = (
     Cause("gain", "a gain of {0:.4g} in {where}", "{flat}"),
     Cause("offset", "an offset of {0:.3g} grey levels in {where}", "{dark}"),
     Cause("black level", "a black level of {0:.3g} grey levels", "{dark}"),
-    Cause("shift", "a view displaced by {0:.2g} pixels of f down and {1:.2g} right in {where}", "{calibrate}"),
+    Cause("shift", "a view {0:.2g} pixels of f too far {1} and {2:.2g} {3} in {where}", "{calibrate}"),
     Cause("rotation", "a view rotated by {0:.2g} degrees in {where}", "{calibrate}"),
     Cause("scale", "a view {0:.3g} times as wide in {where}", "{calibrate}"),
     Cause("flip", "a picture {0} in {where}", "{turn}"),
@@ -336,7 +336,7 @@ class _Search:
         for name, columns in effects.items():
             k = columns.shape[1]
 
-            def words(coefficients: FloatArray, name: str = name, k: int = k) -> tuple[Sequence[float], str]:
+            def words(coefficients: FloatArray, name: str = name, k: int = k) -> tuple[Sequence[float | str], str]:
                 by_sub = coefficients.reshape(count, k)
                 worst = int(np.square(by_sub).sum(axis=1).argmax())
                 return _numbers(name, by_sub[worst]), f"{self._named([worst])}, and others in other sub-imagers"
@@ -435,8 +435,11 @@ def _step(readings: FloatArray) -> float:
     return float(np.diff(values).min()) if whole else 0.0
 
 
-def _numbers(name: str, c: FloatArray) -> Sequence[float]:
+def _numbers(name: str, c: FloatArray) -> Sequence[float | str]:
     """Return the numbers in the words of an effect."""
+    if name == "shift":
+        down, right = c.tolist()
+        return [abs(down), "down" if down > 0 else "up", abs(right), "right" if right > 0 else "left"]
     if name == "gain":  # g - c g is right
         return [1 / max(1 - float(c[0]), 1e-3)]
     if name == "rotation":

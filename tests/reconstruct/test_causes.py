@@ -161,7 +161,7 @@ MADE: dict[str, tuple[str, str, dict[str, Any]]] = {  # to the cause, what a sen
     "all turned": ("flip", "180 degrees in all", {"change": changed(lambda v: v[::-1, ::-1], everywhere)}),
     "swap": ("swap", "(3, 3)", {"change": exchanged}),
     "dead": ("dead", "in sub-imager (2, 1) of type B", {"change": changed(lambda v: 0.05 * v)}),
-    "pixels": ("pixels", "3 damaged pixels", {"change": damaged}),
+    "pixels": ("pixels", "3 in all", {"change": damaged}),
     "clipping": ("clipping", "noise.saturation = 160", {"change": lambda _, v: np.minimum(v, 160.0)}),
     "bits": ("bits", "noise.bits = 6", {"change": lambda _, v: 4 * np.round(v / 4)}),
     "noise": ("noise", "", {"factor": 9.0}),

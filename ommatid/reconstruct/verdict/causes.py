@@ -41,6 +41,7 @@ WORST = 3  # sub-imagers that are examined one by one
 MOST_PIXELS, NUMBERS = 10, 3  # damaged pixels, and numbers that the choice of one of them counts for
 DARK = 0.5  # share of the light that the other sub-imagers predict, below which one counts as dark
 FEWEST_CLIPPED = 3  # readings of exactly the largest value
+LEAST = 1e-300  # divisor
 SEEN = 0.05  # expected square of a whitened residual, from which it tells something
 MOST_NAMED = 5  # sub-imagers in one sentence
 TURNS: tuple[tuple[str, Callable[[FloatArray], FloatArray]], ...] = (
@@ -77,7 +78,7 @@ CAUSES = (
         "parts of the world before or behind the target's plane, for which alone H holds",
         "crop the target to what is at its distance",
     ),
-    Cause("pixels", "{0:.0f} damaged pixels in {where}", "make their readings NaN"),
+    Cause("pixels", "damaged pixels in {where}, {0:.0f} in all", "make their readings NaN"),
     Cause("sub-imager", "readings of {where} that no known cause explains", "make them NaN, or {calibrate}"),
     Cause("bits", "readings in steps of {0:.3g}", "set noise.bits = {1:.3g}, or add {2:.3g} to noise.variance"),
     Cause("noise", "noise of {0:.3g} times the stated variance", "{noise}"),
@@ -391,7 +392,7 @@ class _Search:
         noise, squares, seen = self.task.expected_noise, self.squares(np.zeros(self.m.size)), self.expected > SEEN
         scene, step, expected = self.stack.scene, _step(self.readings), self.expected[seen]
         added = step**2 / 12 - (0.0 if scene.noise is None else scene.noise.quantisation_variance)
-        if (expected * added / noise[seen]).sum() > EXPLAINED * (squares[seen] - expected).sum():
+        if step and (expected * added / noise[seen]).sum() > EXPLAINED * (squares[seen] - expected).sum():
             return "bits", [step, float(np.log2(FULL_SCALE / step)), added]
         slopes = self._effects(self.method.image)["shift"]
         found = {
@@ -411,7 +412,7 @@ class _Search:
         seen, squares = self.expected > SEEN, self.squares(np.zeros(self.m.size))
         grown = (shape / self.task.expected_noise)[seen]
         sizes = np.geomspace(0.05, 1e4, 100)[:, None]
-        variance = self.expected[seen] * (1 + sizes * grown / grown.mean())
+        variance = self.expected[seen] * (1 + sizes * grown / max(grown.mean(), LEAST))
         deviance = (np.log(variance) + squares[seen] / variance).sum(axis=1)
         return float(deviance.min()), 1 + float(sizes[deviance.argmin(), 0])
 

@@ -36,7 +36,7 @@ MOST_EXACT = 4000  # readings
 MOST_SEARCHED = 200_000  # readings; beyond, the search takes longer than the estimate
 EXPLAINED = 0.5  # share of the excess that a cause explains at least, and
 CLEAR = 0.75  # the one that it explains, to first order, where more numbers explain more
-STRUCTURED = 25.0  # criterion of a fault from which readings hold more than noise
+STRUCTURED = 0.2  # share of the excess that a fault explains where readings hold more than noise
 WORST = 3  # sub-imagers that are examined one by one
 MOST_PIXELS, NUMBERS = 10, 3  # damaged pixels, and numbers that the choice of one of them counts for
 DARK = 0.5  # share of the light that the other sub-imagers predict, below which one counts as dark
@@ -163,19 +163,20 @@ def likely_cause(
         return f"its cause is not sought among more than {MOST_SEARCHED} readings; crop the target to see it"
     search, recorded = _Search(method, stack, named), method.task.recorded
     before = excess(recorded, search.squares(np.zeros(search.m.size)))
-    found, where, share = search.best(), "", ""
+    found, where, share, least_left = search.best(), "", "", before
     likely = sorted(found, key=lambda one: one.criterion)
     simplest = [
         (one, EXPLAINED if one is min(found[place:], key=likely.index) else CLEAR) for place, one in enumerate(found)
     ]
     for one, least in (*simplest, *((one, EXPLAINED) for one in likely)):
         left = excess(recorded - method.task.on_all_measurements(one.change, 0.0), search.squares(one.change))
+        least_left = min(left, least_left)
         if left < (1 - least) * before:
             name, (numbers, where) = one.fault.cause, one.fault.words(one.coefficients)
             share = f", which explains {100 - 100 * max(left, 0.0) / before:.0f} % of it"
             break
     else:
-        name, numbers = search.cause_of_squares(likely[0].criterion < -STRUCTURED)
+        name, numbers = search.cause_of_squares(least_left < (1 - STRUCTURED) * before)
     [cause] = (cause for cause in CAUSES if cause.name == name)
     how = cause.remedy.format(*numbers, **remedies(stack, method.task))
     return f"{cause.words.format(*numbers, where=where)}{share}; {how}"

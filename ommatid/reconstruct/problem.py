@@ -157,7 +157,7 @@ class Whitening:
             part = sparse.csc_array(matrix[rows])
             seen = np.flatnonzero(np.diff(part.indptr))
             white = linalg.solve_triangular(factor, part[:, seen].toarray(), lower=True, check_finite=False)
-            starts = np.arange(0, white.size + 1, seen.size)
+            starts = seen.size * np.arange(white.shape[0] + 1)
             indices = np.tile(seen, white.shape[0])
             parts.append(sparse.csr_array((np.asarray(white).ravel(), indices, starts), shape=part.shape))
         return sparse.csr_array(sparse.vstack(parts, format="csr"))

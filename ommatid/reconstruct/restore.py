@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
@@ -16,7 +16,7 @@ from ommatid.runtime.machine import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import averaged
-from ommatid.scenes.model import Model
+from ommatid.scenes.model import RECORDED, Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
@@ -30,12 +30,18 @@ from .misalignment.robust_noise import CAUSE
 from .noise import Noise, UsablePixels, undithered, uniform
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
 from .prior_fit import PriorFit
+from .verdict.causes import likely_cause
 from .verdict.residual import WhitenedResidual, residual_parts
-from .verdict.verdict import ErrorCheck, evidence_of, judge, without_pixels
+from .verdict.verdict import ErrorCheck, judge, without_pixels
 
 CORRECTABLE = 0.35  # share of the error by attenuation, up to which the first order of the noise of H serves
 BEYOND = 0.1  # share of the error by the next order, likewise
 LEAST_FREEDOMS = 5  # of a sample variance, from which its inverse has a variance
+MORE_SAMPLES = {
+    "points": "raise calibration.samples",
+    "transport": "raise calibration.samples",
+    RECORDED: "record more exposures of every point source",
+}
 BUDGET = ("null_space", "noise", "quantisation", "rendering", "calibration", "detail")
 
 
@@ -67,10 +73,22 @@ def verdict_of(
         rounding_share=_rounding_share(assumed.noise),
         pixels_used=int(used.sum()),
         left_out=without_pixels(stack.camera, used),
+        more_samples=MORE_SAMPLES.get(model.record["method"], "measure H more accurately"),
     )
-    light = partial(assumed.method.task.model.light, assumed.method.image)
-    evidence = evidence_of(stack, model, used, light, assumed.prior.kind == "independent")
-    return judge(_parts(stack, model, assumed, result), evidence, check)
+    residual = _whitened(stack, model, assumed, result)
+    if residual is None:
+        return judge([], check, lambda _: "")
+
+    def cause(beyond: Sequence[ResidualPart]) -> str:
+        names = [(part.kind, part.name) for part in beyond if part.kind == beyond[0].kind]
+
+        def excess(_: FloatArray, squares: FloatArray) -> float:
+            parts = residual_parts(replace(residual, squares=squares), stack.camera)
+            return sum(part.chi_squared - part.expected for part in parts if (part.kind, part.name) in names)
+
+        return likely_cause(assumed.method, stack, excess)
+
+    return judge(residual_parts(residual, stack.camera), check, cause)
 
 
 def _rounding_share(noise: Noise) -> float:
@@ -89,13 +107,13 @@ def _spurious(share: FloatArray, expected: ExpectedError) -> float:
     return corrected if corrected > CORRECTABLE or corrected * expected.second_order > BEYOND else 0.0
 
 
-def _parts(stack: Stack, model: Model, assumed: Assumptions, result: MethodResult) -> list[ResidualPart]:
-    """Return chi-squared by part, nothing where a measurement has no expected noise."""
+def _whitened(stack: Stack, model: Model, assumed: Assumptions, result: MethodResult) -> WhitenedResidual | None:
+    """Return the whitened residual, None where a measurement has no expected noise."""
     expected_noise = assumed.method.task.expected_noise
     if result.residual_power is None or not expected_noise.size:
-        return []
+        return None
     total = total_variance(assumed.noise)
-    residual = WhitenedResidual(
+    return WhitenedResidual(
         squares=expected_noise * np.square(result.multipliers),
         power=result.residual_power,
         used=assumed.usable.used,
@@ -103,7 +121,6 @@ def _parts(stack: Stack, model: Model, assumed: Assumptions, result: MethodResul
         shared=_shared(model, assumed, total, result),
         largest=max(1.0, _largest_ratio(total, expected_noise), assumed.method.task.prior_ratio),
     )
-    return residual_parts(residual, stack.camera)
 
 
 def _spread(stack: Stack, assumed: Assumptions, total: FloatArray) -> FloatArray:

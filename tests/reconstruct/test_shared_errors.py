@@ -250,7 +250,7 @@ def test_a_sub_imager_off_by_ten_deviations_is_found() -> None:
     values[part] += 10 * model.changes(picture)[1][part]
     wrong = restore(replace(stack, values=values), model, picture)
     assert not wrong.verdict.trusted
-    assert "sub-imager (1, 1) of type A is not where H places it" in " ".join(wrong.verdict.reasons)
+    assert "in sub-imager (1, 1) of type A, which explains" in " ".join(wrong.verdict.reasons)
     assert restore(stack, model, picture).verdict.trusted
 
 

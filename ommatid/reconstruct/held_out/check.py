@@ -26,11 +26,13 @@ from ommatid.scenes.stack import Stack
 
 from ..assumptions import assumptions_for, with_fallback
 from ..detail.detailed_model import DetailedModel
-from ..method_choice import MethodChoice
-from ..methods.method import EstimationTask, Execution
+from ..method_choice import METHODS, MethodChoice
+from ..methods.method import EstimationTask, Execution, Method
+from ..misalignment.misaligned_methods import RobustMethod
 from ..output.run_json import HeldOutEntry, HeldOutPrior, HeldOutReport, HeldOutVerdict, HeldOutWindows
 from ..prior import FittedPrior
 from ..prior_fit import fit_prior
+from ..verdict.causes import likely_cause
 from .windows import HeldOutSums, held_out_sums, windows
 
 SIGNIFICANCE = 1e-4  # of all sub-imagers together
@@ -74,14 +76,16 @@ def check_held_out(
 
     def checked(choice: MethodChoice) -> HeldOutReport:
         assumed = assumptions_for(stack, model, choice, execution)
-        found = check_task(assumed.method.task, choice.method, fitted=fitted, execution=execution)
+        found = check_task(stack, assumed.method.task, choice.method, fitted=fitted, execution=execution)
         return with_fitted_prior(found) if stack.scene.prior.kind == "fit" else found
 
     return with_fallback(stack, model, checked)
 
 
 @one_thread()
-def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Execution | None = None) -> HeldOutReport:
+def check_task(
+    stack: Stack, task: EstimationTask, method: str, *, fitted: bool, execution: Execution | None = None
+) -> HeldOutReport:
     """Check a task whose noise is known; `method` is that of the estimate. Arguments and errors: `check_held_out`."""
     if method == "fit":
         raise InputError(
@@ -96,14 +100,29 @@ def check_task(task: EstimationTask, method: str, *, fitted: bool, execution: Ex
     to_fit = fitted and task.prior.kind == "independent" and len(task.model.camera.sub_imagers) > 1
     prior = _fitted(task) if to_fit else None
     robust, execution = method == "robust", execution or Execution()
-    if prior is None:
-        return _check(task, robust, execution, fitted=False)
-    narrow = _check(replace(task, prior=prior), robust, execution, fitted=True)
-    if narrow.verdict.trusted is not False:
-        return narrow
     # Parts of a picture differ more from one another than the fitted prior knows; the scene's is wide enough for all.
-    wide = _check(task, robust, execution, fitted=False)
-    return wide if wide.verdict.trusted is not False else narrow
+    tasks = [task] if prior is None else [replace(task, prior=prior), task]
+    found: list[HeldOutReport] = []
+    for each in tasks:
+        found.append(_check(each, robust, execution, fitted=each is not task))
+        if found[-1].verdict.trusted is not False:
+            return found[-1]
+    return _with_cause(found[0], stack, METHODS[method](tasks[0], execution))
+
+
+def _with_cause(report: HeldOutReport, stack: Stack, method: Method) -> HeldOutReport:
+    """Return the report of sub-imagers that disagree with the likely cause."""
+    robust = isinstance(method, RobustMethod)
+    worst = np.array([entry.disagrees or entry.named for entry in report.sub_imagers])
+
+    def excess(recorded: FloatArray, _: FloatArray) -> float:
+        sums = held_out_sums(replace(method.task, recorded=recorded), robust, method.execution)
+        return float(np.maximum(_excess(sums)[worst], 0.0).sum())
+
+    index = {entry.name: number for number, entry in enumerate(report.sub_imagers)}
+    named = [index[entry.name] for entry in report.worst() if entry.named]
+    reason = f"{report.verdict.reasons[0]}: {likely_cause(method, stack, excess, named)}"
+    return report.model_copy(update={"verdict": HeldOutVerdict(trusted=False, reasons=(reason,))})
 
 
 def _fitted(task: EstimationTask) -> FittedPrior | None:
@@ -154,14 +173,14 @@ def with_fitted_prior(report: HeldOutReport) -> HeldOutReport:
 
 
 @one_thread()
-def quick_check(task: EstimationTask, method: str) -> HeldOutReport | None:
+def quick_check(stack: Stack, task: EstimationTask, method: str) -> HeldOutReport | None:
     """Check a task with its own prior as a part of a run; None where it is not possible, or would take long."""
     possible = method != "fit" and task.used.any() and bool((task.expected_noise > 0).all())
     most = MOST_QUICK_DETAILED if isinstance(task.model, DetailedModel) else MOST_QUICK
     if not possible or task.expected_noise.size > most or len(windows(task, method == "robust")[0]) > 1:
         return None
     try:
-        return check_task(task, method, fitted=False)
+        return check_task(stack, task, method, fitted=False)
     except InputError:  # the noise is too small
         return None
 
@@ -267,15 +286,11 @@ def _verdict(report: HeldOutReport) -> HeldOutVerdict:
     if named:
         one = len(named) == 1
         subject = f"sub-imager {_listed(named)} contradicts" if one else f"sub-imagers {_listed(named)} contradict"
-        reason = (
-            f"{subject} the others: {_size(named[0])}; {'its' if one else 'their'} H is not this camera's, or"
-            f" {'its' if one else 'their'} pixels are damaged; the others agree"
-        )
+        reason = f"{subject} the others, which agree; {_size(named[0])}"
     else:
         reason = (
             f"{len(disagreeing)} of {report.judged} sub-imagers contradict one another, most {_listed(disagreeing)}:"
-            f" {_size(disagreeing[0])}; H is not this camera's, the world has depth or detail finer than f, or the"
-            " noise is larger than stated"
+            f" {_size(disagreeing[0])}"
         )
     return HeldOutVerdict(trusted=False, reasons=(reason,))
 

@@ -64,6 +64,10 @@ class DenseMethod(Method):
         """Compute f^ without its error: (N,)."""
         return self.estimate.image
 
+    def observe(self, image: FloatArray) -> FloatArray:
+        """Return H f by the H of the estimate: (N,) to (measurements used,), or with columns."""
+        return self.observation[0] @ image
+
     def operators(self) -> PosteriorOperators | None:
         """Return the operators of the estimate, None where a measurement has no noise."""
         form, noise, correlated = self.estimate.form, self.task.expected_noise, self.correlated
@@ -75,7 +79,7 @@ class DenseMethod(Method):
             return problem.prior.apply_root(solution)[:, 0]
 
         def weigh(values: FloatArray) -> FloatArray:
-            return values / noise if correlated is None else correlated.white.multipliers(self.white(values))
+            return (values.T / noise).T if correlated is None else correlated.white.multipliers(self.white(values))
 
         if not problem.noisy:
             return None

@@ -350,6 +350,10 @@ class Method(ABC):
         """The estimate where the image's level is the prior's mean: (N,)."""
         return self.estimate_image()
 
+    def observe(self, image: FloatArray) -> FloatArray:
+        """Return H f by the H of the estimate: (N,) to (measurements used,), or with columns."""
+        return self.task.observe(image)
+
     @abstractmethod
     def estimate_image(self) -> FloatArray:
         """Compute the estimate where the image's level is the prior's mean, without its error: (N,)."""

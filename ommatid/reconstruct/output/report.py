@@ -33,7 +33,7 @@ from .run_json import (
 def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunReport:
     """Return the content of run.json, without a fingerprint."""
     start = perf_counter()
-    held_out, error = _held_out(restoration), _error(restoration, stack)
+    held_out, error = _held_out(restoration, stack), _error(restoration, stack)
     stages = {
         "render": _stage(stack.record),
         "calibrate": _stage(model.record),
@@ -75,8 +75,8 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
     )
 
 
-def _held_out(restoration: Reconstruction) -> dict[str, Any]:
-    report = quick_check(restoration.task, restoration.choice.method)
+def _held_out(restoration: Reconstruction, stack: Stack) -> dict[str, Any]:
+    report = quick_check(stack, restoration.task, restoration.choice.method)
     if report is None:
         return {}
     fitted = restoration.fit is not None and restoration.fit.prior is not None

@@ -2,8 +2,7 @@
 
 There are three checks: chi-squared of the residual in all and by part, the interval of the error where the truth is
 known, and the bound on the variances. A deviation counts if it is significant and exceeds a tenth of the number that is
-stated; what can change a number by less is a note. Likely causes of a residual larger than expected are chosen from
-what the scene, the stack and H say of themselves.
+stated; what can change a number by less is a note.
 """
 
 from __future__ import annotations
@@ -15,161 +14,28 @@ from typing import Any, cast
 import numpy as np
 from scipy import optimize, special
 
-from ommatid.runtime.arrays import BoolArray, FloatArray
+from ommatid.runtime.arrays import BoolArray
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.model import Model
-from ommatid.scenes.stack import Stack
 
 from ..expected_error import COVERAGE, Interval
 from ..noise import DITHER
 from ..output.run_json import ResidualPart, VerdictReport
+from .causes import MOST_NAMED, listed, named
 from .residual import sidak
 
-DARK = 0.5  # share of the light of a type's other sub-imagers below which one counts as dark, and
-UNEXPLAINED = 0.8  # share of the light that the estimate predicts, since a part of the target may be dark
-FEW = 0.2  # share of the sub-imagers that are few
-MOST_NAMED = 5  # sub-imagers in one sentence
 SIGNIFICANCE = 1e-4  # of the whole run, over all parts of the residual (Sidak)
 SIZE = 0.1  # relative deviation from which a number is wrong
 ROUGH = 0.05  # relative error of a map of variances from which it is a doubt
 STRIKING = 1.5  # ratio to the whole from which a region is worth naming
-RAISE = "raise calibration.samples, or record each point more often"
-UNCERTAIN = f": the uncertainty of H is more than a small correction; {RAISE}"
+UNCERTAIN = ": the uncertainty of H is more than a small correction; "
 SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
-
-
-@dataclass(frozen=True)
-class RunEvidence:
-    """What is known about a run besides its residual.
-
-    dark : sub-imagers that receive far less light than the others of their type, by name
-    deep : True if there is a world, which may lie before or behind the target's plane
-    designed : True if H is that of the design, and the camera is misaligned or has lenses of surfaces
-    calibrated : True if H was measured;  unflattened : True for recorded frames without a flat frame
-    of_pixels : True if detail finer than f matters to this camera, and the estimate takes the world as made of f's
-        pixels;  detailed : True if it takes finer detail into account
-    """
-
-    dark: tuple[str, ...]
-    deep: bool
-    designed: bool
-    calibrated: bool
-    recorded: bool
-    unflattened: bool
-    of_pixels: bool
-    detailed: bool
-
-
-def evidence_of(
-    stack: Stack, model: Model, used: BoolArray, light: Callable[[], FloatArray], independent: bool
-) -> RunEvidence:
-    """Collect what may explain a residual.
-
-    used : (M,) True for measurements that are used;  light : yields the light, (M,), that the estimate predicts
-    """
-    camera, scene = stack.camera, stack.scene
-    ideal = model.record["method"] == "ideal"
-    recorded = stack.record.get("method") == "imported"
-    return RunEvidence(
-        dark=_dark(stack, used, light),
-        deep=scene.world is not None,
-        designed=ideal and (camera.tolerance is not None or _has_surfaces(camera)),
-        calibrated=not ideal,
-        recorded=recorded,
-        unflattened=recorded and stack.record.get("flat") is False,
-        of_pixels=not camera.covers_whole_pixels and (independent or not camera.has_detail),
-        detailed=camera.has_detail and not independent,
-    )
-
-
-def _has_surfaces(camera: Camera) -> bool:
-    return any(lens_type.optics.surfaces is not None for lens_type in camera.types)
 
 
 def without_pixels(camera: Camera, used: BoolArray) -> tuple[str, ...]:
     """Return the names of the sub-imagers none of whose pixels is used."""
     pairs = zip(camera.sub_imagers, camera.slices(), strict=True)
     return tuple(sub.name for sub, part in pairs if not used[part].any())
-
-
-def _dark(stack: Stack, used: BoolArray, light: Callable[[], FloatArray]) -> tuple[str, ...]:
-    camera = stack.camera
-    means = _means(stack.values, used, camera)
-    darker: list[int] = []
-    for lens_type in camera.types:
-        index = [number for number, sub in enumerate(camera.sub_imagers) if sub.type is lens_type]
-        typical = float(np.nanmedian(means[index])) if np.isfinite(means[index]).any() else 0.0
-        darker += [number for number in index if means[number] < DARK * typical]
-    if not darker:
-        return ()
-    predicted = _means(light(), used, camera)
-    return tuple(
-        camera.sub_imagers[number].name for number in darker if means[number] < UNEXPLAINED * predicted[number]
-    )
-
-
-def _means(values: FloatArray, used: BoolArray, camera: Camera) -> FloatArray:
-    """Return the mean of each sub-imager's measurements that are used."""
-    if used.all():
-        return np.array([_mean(values[part]) for part in camera.slices()])
-    return np.array([_mean(values[part][used[part]]) for part in camera.slices()])
-
-
-def _mean(values: FloatArray) -> float:
-    return float(values.mean()) if values.size else float("nan")
-
-
-def likely_causes(parts: Sequence[ResidualPart], evidence: RunEvidence) -> str:
-    """Return the likely causes of a residual that is larger than expected in some of all `parts`, as one clause."""
-    if evidence.dark:
-        verb = "is" if len(evidence.dark) == 1 else "are"
-        return f"{listed(evidence.dark)} {verb} dark, covered or dead"
-    if evidence.deep:
-        return "parts of the world lie before or behind the target's plane, for which alone H holds"
-    few, fine = _few(parts), evidence.recorded or evidence.of_pixels
-    if evidence.designed:
-        return "H as designed is not this camera's; calibrate it, or fit its misalignment"
-    if few and not fine:
-        beside = "" if len(few) == 1 else ", or one beside it,"
-        return f"{named(few[:1])}{beside} is not where H places it"
-    causes = ["the pixels differ in gain, for which no flat frame was given (--flat)"] if evidence.unflattened else []
-    causes += ["the world has detail finer than the pixels of f"] if fine else []
-    causes += ["the world is rougher than its prior"] if evidence.detailed else []
-    causes.append(f"H{'' if evidence.calibrated else ', which was not calibrated,'} is not this camera's")
-    causes.append("the noise is larger than stated")
-    return f"{', '.join(causes[:-1])} or {causes[-1]}"
-
-
-def _few(parts: Sequence[ResidualPart]) -> list[str]:
-    """Return the few sub-imagers that bring more than half of all the excess, the worst first, if they do."""
-    subs = sorted(
-        (part for part in parts if part.kind == "sub-imager"), key=lambda part: part.expected - part.chi_squared
-    )
-    total = sum(max(part.chi_squared - part.expected, 0.0) for part in subs)
-    most, excess = subs[: min(MOST_NAMED, int(FEW * len(subs)))], 0.0
-    for number, part in enumerate(most, 1):
-        excess += part.chi_squared - part.expected
-        if excess > 0.5 * total:
-            return [part.name for part in most[:number]]
-    return []
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return sub-imagers in words, the first few of many."""
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return named(names[:MOST_NAMED]) + more
-
-
-def named(names: Sequence[str]) -> str:
-    """Return sub-imagers in words, such as "sub-imagers (0, 7), (1, 7) of type I", from their names."""
-    by_type: dict[str, list[str]] = {}
-    for name in names:
-        lens, k, l = name.rsplit(".", 2)  # noqa: E741  (the paper's letter)
-        by_type.setdefault(lens, []).append(f"({int(k)}, {int(l)})")
-    word = "sub-imager" if len(names) == 1 else "sub-imagers"
-    groups = [f"{', '.join(places)} of type {lens}" for lens, places in by_type.items()]
-    return f"{word} {' and '.join(groups)}"
 
 
 @dataclass(frozen=True)
@@ -184,6 +50,7 @@ class ErrorCheck:
     undithered : noise over the quantisation step, None where it is large enough to make rounding errors independent
     rounding_share : of the noise
     pixels_used : sensor pixels;  left_out : sub-imagers without any usable pixel, by name
+    more_samples : how to reduce the uncertainty of H
     """
 
     mse: float | None
@@ -199,6 +66,7 @@ class ErrorCheck:
     rounding_share: float
     pixels_used: int
     left_out: tuple[str, ...]
+    more_samples: str
 
     @property
     def most_by_rounding(self) -> float:
@@ -217,11 +85,16 @@ class _Findings:
     doubts: list[str]
 
 
-def judge(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck) -> VerdictReport:
-    """Return the verdict from the residual by part, none where it was not checked, and the other checks."""
+def judge(
+    parts: list[ResidualPart], check: ErrorCheck, cause: Callable[[Sequence[ResidualPart]], str]
+) -> VerdictReport:
+    """Return the verdict from the residual by part, none where it was not checked, and the other checks.
+
+    cause : the likely cause of a residual that is larger than expected in some parts
+    """
     findings = _Findings([], [], [], [])
     if check.pixels_used:
-        _judge_residual(parts, evidence, check, findings)
+        _judge_residual(parts, check, cause, findings)
         _judge_error(check, findings)
         _judge_rounding(check, findings)
         _judge_assumptions(check, findings)
@@ -260,7 +133,9 @@ def excesses(parts: list[ResidualPart], largest: float = 1.0) -> list[ResidualPa
     return [part for part in parts if sidak([part.p_value] * len(parts)) < SIGNIFICANCE and part.ratio > most]
 
 
-def _judge_residual(parts: list[ResidualPart], evidence: RunEvidence, check: ErrorCheck, findings: _Findings) -> None:
+def _judge_residual(
+    parts: list[ResidualPart], check: ErrorCheck, cause: Callable[[Sequence[ResidualPart]], str], findings: _Findings
+) -> None:
     if not parts:
         findings.notes.append("chi-squared was not checked: some measurements are expected to have no noise")
         return
@@ -268,7 +143,7 @@ def _judge_residual(parts: list[ResidualPart], evidence: RunEvidence, check: Err
     if check.noise_fitted:
         findings.notes.append("the noise was fitted to this stack, so chi-squared was checked by part only")
     if beyond:
-        findings.reasons.append(f"{_excess_words(whole, beyond)}: {likely_causes(parts, evidence)}")
+        findings.reasons.append(f"{_excess_words(whole, beyond)}: {cause(beyond)}")
         return
     findings.passed.append(f"the residual is {whole.ratio:.3g} times its expectation")
     uncertain = check.calibration_share > SIZE
@@ -313,7 +188,7 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
         words = f"the error, {mse:.4g}, lies {{}} its 99 % interval, {interval.low:.4g} to {interval.high:.4g}"
         significant, uncertain = error_p_value(mse, interval) < SIGNIFICANCE, check.calibration_share > SIZE
         if mse > (1 + SIZE) * check.most_by_rounding * interval.high and significant:
-            findings.reasons.append(words.format("above") + (UNCERTAIN if uncertain else ""))
+            findings.reasons.append(words.format("above") + (UNCERTAIN + check.more_samples if uncertain else ""))
         elif mse < (1 - SIZE) * interval.low and significant:
             cause = "rounding, or the noise" if check.undithered is not None else "the noise"
             cause += ", or the uncertainty of H," if uncertain else "," if check.undithered is not None else ""
@@ -369,12 +244,12 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
     if check.spurious > SIZE:
         findings.reasons.append(
             "the noise of H adds spurious information about pixels that the lens types determine poorly, more than the"
-            f" predicted error can count; {RAISE}, or take calibration.method = 'ideal' if the camera is"
+            f" predicted error can count; {check.more_samples}"
         )
     elif check.spurious_share > SPURIOUS_SHARE:
         findings.notes.append(
             f"the noise of H may have produced {100 * check.spurious_share:.2g} % of the information on a pixel, on"
-            f" average; {RAISE}"
+            f" average; {check.more_samples}"
         )
     if check.fit_doubtful:
         findings.reasons.append(

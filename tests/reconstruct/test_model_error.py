@@ -10,7 +10,7 @@ from scipy import sparse
 
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, PosteriorOperators, total_variance
-from ommatid.reconstruct.methods.tile_method import iterative_operators
+from ommatid.reconstruct.methods.tile_method import TileMethod
 from ommatid.reconstruct.model_error.attenuation import Attenuation
 from ommatid.reconstruct.model_error.contrast import Waves, continued, likeliest_share, true_contrast
 from ommatid.runtime.arrays import FloatArray
@@ -196,14 +196,14 @@ def test_the_noise_of_an_estimate_is_not_taken_for_contrast(contrast: float) -> 
         assert plain > true + 4 * chance  # the noise of the estimate alone
 
 
-def test_iterative_operators_are_those_of_the_dense_form() -> None:
+def test_operators_of_tiles_are_those_of_the_dense_form() -> None:
     exact = _exact()
     rng = np.random.default_rng(5)
     method = _method(
         _measured(exact, rng), exact.matrix @ (127.5 + 60 * rng.normal(size=361)), np.full(exact.measurements, NOISE)
     )
-    dense, iterative = _operators(method), iterative_operators(method.task)
-    image, values = rng.normal(size=361), rng.normal(size=exact.measurements)
+    dense, iterative = _operators(method), TileMethod(method.task, Execution()).operators()
+    image, values = 1e3 * rng.normal(size=361), 1e3 * rng.normal(size=exact.measurements)
     for name, argument in (("gain", values), ("posterior", image), ("hidden", image), ("weigh", values)):
         expected = getattr(dense, name)(argument)
         np.testing.assert_allclose(getattr(iterative, name)(argument), expected, atol=0.02 * np.abs(expected).max())

@@ -31,8 +31,8 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.observation import Observation
 
-from ..methods.method import EstimationTask, PosteriorOperators
-from .bands import Bands
+from ..methods.method import EstimationTask, PosteriorOperators, is_uniform
+from .bands import Bands, bands_of
 
 Indices = NDArray[np.intp]
 
@@ -234,6 +234,18 @@ class FrameSystem:
     def _precondition(self, image: FloatArray) -> FloatArray:
         preconditioner = self.preconditioner
         return image if preconditioner is None else preconditioner.solve(image.reshape(self.shape)).ravel()
+
+
+def frame_system(task: EstimationTask) -> FrameSystem:
+    """Return the system of a task whose every measurement has noise."""
+    if is_uniform(task.expected_noise) and task.complete:
+        weights = np.broadcast_to(1 / task.expected_noise[:1], task.expected_noise.shape)
+    else:
+        weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
+    prior, observation, camera = task.precision_on(task.shape), task.model.applied, task.model.camera
+    spectrum = np.broadcast_to(1 / np.asarray(prior), task.shape)
+    bands = bands_of(camera, task.finer, spectrum, weights, observation)
+    return FrameSystem(observation, weights, prior, bands=bands, types=tuple(camera.type_slices()))
 
 
 def mean_accuracy(task: EstimationTask) -> float:

@@ -35,11 +35,11 @@ from ..methods.method import (
 from ..output.run_json import SolverReport
 from ..prior import coloured
 from ..verdict.residual import ResidualInputs, ResidualPower
-from .bands import bands_of
 from .conjugate_gradients import (
     BandedSystem,
     FrameSystem,
     Solution,
+    frame_system,
     mean_accuracy,
     posterior_operators,
     serves,
@@ -89,19 +89,10 @@ class FrameMethod(Method):
     @cached_property
     def system(self) -> FrameSystem:
         """The linear system of the frame."""
-        task = self.task
-        if is_uniform(task.expected_noise) and task.complete:
-            weights = np.broadcast_to(1 / task.expected_noise[:1], task.expected_noise.shape)
-        else:
-            weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
-        prior, observation = task.precision_on(task.shape), task.model.applied
+        system = frame_system(self.task)
         if self._banded:
-            banded = BandedSystem(observation, weights, prior, task.model.matrix)
+            banded = BandedSystem(system.observation, system.weights, system.prior, self.task.model.matrix)
             return self.shared("system", self.conditions(), lambda: banded)[0]
-        spectrum = np.broadcast_to(1 / np.asarray(prior), task.shape)
-        bands = bands_of(task.model.camera, task.finer, spectrum, weights, observation)
-        types = tuple(task.model.camera.type_slices())
-        system = FrameSystem(observation, weights, prior, bands=bands, types=types)
         variances = np.divide(1, system.mean_weights, dtype=np.float64)
         conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
         nearly = _with_mean_kernels(system)

@@ -77,8 +77,7 @@ class Windows:
     def frame(self, observation: Observation) -> VarianceMap:
         """Return the maps of a whole frame from the cores of windows side by side."""
         parts = [
-            part if part.entries > MOST_ENTRIES else Entries(part.to_sparse(), part.shape)
-            for part in observation.parts
+            part if part.entries > MOST_ENTRIES else Entries(part.to_sparse(), part.shape) for part in observation.parts
         ]
         observation = Observation(observation.shape, tuple(parts))
         starts = [range(0, size, core) for size, core in zip(self.task.shape_of_f, self.core, strict=True)]

@@ -5,16 +5,13 @@ over any distance, and the cost is a factor of several; where they leave none it
 against a window many times as large as a tile.
 
 Operators of the estimate for means over the frame are those of the whole frame, which the estimate by tiles approaches
-to a few hundredths. Conjugate gradients compute them to the few digits that means need.
+to a few hundredths.
 """
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 import numpy as np
-from scipy import linalg, sparse
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -25,12 +22,11 @@ from ommatid.runtime.streams import Purpose, probe
 
 from ..expected_error import ExpectedError, interval
 from ..frame.conjugate_gradients import (
-    FrameSystem,
-    Indices,
-    banded_cholesky,
+    frame_system,
+    mean_accuracy,
     posterior_operators,
-    shorter_side_first,
 )
+from ..frame.swept import whole_variances
 from ..output.run_json import SolverReport
 from ..verdict.residual import ResidualInputs, ResidualPower
 from .method import (
@@ -56,8 +52,6 @@ from .tile_solver import (
 TILES = 3  # sides of the window, in tiles
 PIXELS = 12  # whose variances are compared
 NOTABLE = 1.1  # factor that is worth saying
-RESIDUAL = 1e-3  # relative: the error of the solution is about 5 times as large
-MAX_STEPS = 1000  # reached only where lens types leave pixels undetermined
 MAX_TILES = 256  # in one task
 MANY = 250_000  # pixels above which each draw takes long and few are enough
 DRAWS, FEW_DRAWS = 8, 2  # of images and noise for the expected residual
@@ -82,11 +76,13 @@ def tile_cost(task: EstimationTask, variance: FloatArray) -> float | None:
     matrix, shape = window.matrix, window.shape
     information = matrix.T @ sparse.csr_array(matrix.multiply((1 / window.expected_noise)[:, None]))
     precision = sparse.csr_array(information + sparse.eye_array(matrix.shape[1], format="csr") / task.prior.variance)
-    pixels = _middle_pixels(shape, size)
-    exact = _variances(precision, shape, pixels)
-    frame_rows, frame_columns = np.divmod(pixels, shape[1])
-    tiled = variance.reshape(task.shape)[frame_rows + rows.start, frame_columns + columns.start]
-    return float(tiled.mean() / exact.mean())
+    exact = whole_variances(precision, shape, task.model.windowed.reach - 1)
+    rng = probe(Purpose.TILE_COST)
+    down, across = (
+        rng.integers((length - min(size, length)) // 2, (length + min(size, length)) // 2, PIXELS) for length in shape
+    )
+    tiled = variance.reshape(task.shape)[down + rows.start, across + columns.start]
+    return float(tiled.mean() / exact[down, across].mean())
 
 
 def words(cost: float | None) -> str:
@@ -94,43 +90,6 @@ def words(cost: float | None) -> str:
     if cost is None or cost < NOTABLE:
         return ""
     return f"; tiles cost about a factor of {cost:.2g} of the expected error here"
-
-
-def _middle_pixels(shape: tuple[int, int], size: int) -> Indices:
-    rng = probe(Purpose.TILE_COST)
-    row, column = (
-        rng.integers((length - min(size, length)) // 2, (length + min(size, length)) // 2, PIXELS) for length in shape
-    )
-    return row * shape[1] + column
-
-
-def _variances(precision: sparse.csr_array, shape: tuple[int, int], pixels: Indices) -> FloatArray:
-    """Return the diagonal of K^-1 at some pixels."""
-    order = shorter_side_first(shape)
-    place = np.empty_like(order)
-    place[order] = np.arange(order.size)
-    unit = np.zeros((order.size, pixels.size))
-    columns = np.arange(pixels.size)
-    unit[place[pixels], columns] = 1.0
-    factor = banded_cholesky(precision, order)
-    solved = np.asarray(linalg.cho_solve_banded((factor, True), unit, check_finite=False))
-    return solved[place[pixels], columns]
-
-
-def iterative_operators(task: EstimationTask) -> PosteriorOperators:
-    """Return the operators of a task whose every measurement has noise."""
-    weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
-    system = FrameSystem(task.model.applied, weights, task.precision_on(task.shape))
-    diagonal = np.asarray(task.model.matrix.power(2).T @ weights) + float(np.mean(system.prior))
-    shape = (diagonal.size, diagonal.size)
-    precision = LinearOperator(shape, matvec=system.apply, dtype=np.float64)
-    scaled = LinearOperator(shape, matvec=lambda image: image / diagonal, dtype=np.float64)
-
-    def posterior(image: FloatArray) -> FloatArray:
-        solution: Any = cast(Any, cg)(precision, image, rtol=RESIDUAL, maxiter=MAX_STEPS, M=scaled)[0]
-        return np.asarray(solution, dtype=np.float64)
-
-    return posterior_operators(system, task, posterior)
 
 
 class TileMethod(Method):
@@ -159,7 +118,16 @@ class TileMethod(Method):
 
     def operators(self) -> PosteriorOperators | None:
         """Return the operators of the whole frame, None where a measurement has no noise."""
-        return iterative_operators(self.task) if (self.task.expected_noise > 0).all() else None
+        task = self.task
+        if not (task.expected_noise > 0).all():
+            return None
+        system = frame_system(task)
+        return posterior_operators(
+            system,
+            task,
+            lambda right: system.solve(right, mean_accuracy(task)).image,
+            lambda weights: system.solve_weights(weights, mean_accuracy(task)),
+        )
 
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""

@@ -137,6 +137,7 @@ def test_a_window_turns_the_map_of_mean_kernels_into_that_of_all(monkeypatch: py
         posterior = np.linalg.inv(np.linalg.inv(root @ root.T) + matrix.T @ (matrix / noise[:, None]))
         maps.append(np.diagonal(posterior).astype(np.float64).reshape(CAMERA.shape))
     task: Any = SimpleNamespace(
+        shape=CAMERA.shape,
         shape_of_f=CAMERA.shape,
         finer=1,
         precision_on=lambda _: 1 / spectrum,

@@ -268,7 +268,7 @@ class Bands:
     @cached_property
     def prior_variance(self) -> float:
         """Prior variance of a pixel of f, averaged over the image."""
-        return float(self._of_pixels[3].mean())
+        return float(self._folded(self.spectrum * np.square(self._pixels))[:-1, :-1].mean())
 
     def _folded(self, waves: FloatArray) -> FloatArray:
         """Return the sums of coefficients over the waves of each group: (rows + 1, columns + 1)."""

@@ -173,7 +173,7 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
             maps = frame_map(task, system, system.bands, actual, far=far)
             maps = by_windows(maps, task, task.model.applied, actual) if varies else maps
             yield _with_corners(maps, task, system, actual) if narrow else maps
-        if not (few and (varies or uneven)):
+        if not few or task.finer > 1 or not (varies or uneven):
             return
     yield windows_map(task, system.weights, system.bands, actual, HALO)
     if few and not narrow:

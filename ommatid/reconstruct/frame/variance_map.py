@@ -261,7 +261,7 @@ def frame_map(task: EstimationTask, system: FrameSystem, bands: Bands, actual: F
     actual : (measurements used,) noise;  far : True where errors reach from edge to edge
     """
     ratios, shape = mean_ratios(task, system.weights, actual), bands.shape
-    grid = _with_shape(bands, task, (min(GRID, shape[0]), min(GRID, shape[1])))
+    grid = without_edges(task, bands)
     if isinstance(system.prior, float) and is_narrow(task) and not far:
         even = Strips.of(task, bands, system.prior)
     else:
@@ -309,6 +309,11 @@ def unseen_corners(bands: Bands) -> list[tuple[int, int]]:
 def is_uneven(task: EstimationTask, system: FrameSystem) -> bool:
     """Return True if the noise of neighbouring pixels differs."""
     return float(np.ptp(np.log(levels(task, system)))) > EVEN_EDGES
+
+
+def without_edges(task: EstimationTask, bands: Bands) -> Bands:
+    """Return bands of few enough waves for the variances of pixels far from the edges."""
+    return _with_shape(bands, task, (min(GRID, bands.shape[0]), min(GRID, bands.shape[1])))
 
 
 def _with_shape(bands: Bands, task: EstimationTask, shape: tuple[int, int]) -> Bands:

@@ -20,7 +20,16 @@ from ommatid.scenes.observation import Entries, Observation
 from ..methods.method import EstimationTask
 from .bands import Bands
 from .swept import swept_maps
-from .variance_map import VarianceMap, information, is_narrow, mean_ratios, moments, precision_map, prior_precision
+from .variance_map import (
+    VarianceMap,
+    information,
+    is_narrow,
+    mean_ratios,
+    moments,
+    precision_map,
+    prior_precision,
+    without_edges,
+)
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
 HALO, LONG_HALO = 8, 16  # pixels of f around it
@@ -95,11 +104,15 @@ class Windows:
         return VarianceMap(*total)
 
     def _numbers(self, rows: slice, columns: slice) -> IntArray:
-        """Return the measurements used whose middles lie in a window, in ascending order."""
+        """Return the measurements used whose middles lie in a window, or beyond an edge that it touches, ascending."""
+        (top, bottom), (left, right) = (
+            (part.start or -np.inf, part.stop if part.stop < size else np.inf)
+            for part, size in zip((rows, columns), self.task.shape, strict=True)
+        )
         order, down = self._by_row
-        near = order[np.searchsorted(down, rows.start, "right") : np.searchsorted(down, rows.stop)]
+        near = order[np.searchsorted(down, top, "right") : np.searchsorted(down, bottom)]
         across = self.task.model.camera.middles[1][near]
-        return np.sort(near[(across > columns.start) & (across < columns.stop) & self.task.used[near]])
+        return np.sort(near[(across > left) & (across < right) & self.task.used[near]])
 
     @cached_property
     def _by_row(self) -> tuple[IntArray, FloatArray]:
@@ -133,7 +146,7 @@ def windows_map(task: EstimationTask, weights: FloatArray, bands: Bands, actual:
 
     weights : (M,) 1 / Rv;  bands : of a camera like this one;  actual : (measurements used,) noise
     """
-    beside = bands.variances(1.0, mean_ratios(task, weights, actual))[0]
+    beside = without_edges(task, bands).variances(1.0, mean_ratios(task, weights, actual))[0]
     core = (CORE, CORE)
     if is_narrow(task):
         widest = max(ceil(each.ratio) for each in task.model.camera.types)

@@ -21,6 +21,7 @@ from .summary import skipped_words
 
 Row = tuple[str, str]
 
+UNDETERMINED = 5.0  # deviation of the logarithm of a fitted number that may be anything
 MAX_NAMES = 5  # sub-imagers named in one row
 VERDICT = "verdict"
 
@@ -158,7 +159,8 @@ def _diagnostic_rows(diagnostics: DiagnosticsReport, unknowns: int) -> list[Row]
         lines.append(("chi-squared of the residual", f"{residual.chi_squared:.4g}, {expected}"))
     for name, number in diagnostics.fit.items():
         unit = " pixels of f" if name == "correlation_length" else ""
-        precision = f"within a factor of {exp(number.log_deviation):.3g}"
+        known = number.log_deviation < UNDETERMINED
+        precision = f"within a factor of {exp(number.log_deviation):.3g}" if known else "which the stack leaves open"
         lines.append((f"fitted {name.replace('_', ' ')}", f"{number.value:.4g}{unit}, {precision}"))
     return lines
 

@@ -423,7 +423,12 @@ def _mean_prior(
 def _numbers_of(
     spectra: list[_Spectrum], posteriors: list[ScalePosterior], shares: FloatArray
 ) -> dict[str, tuple[float, float]]:
-    """Return variance, exponent, and the correlation length of spectra that have one, with relative deviations."""
+    """Return variance, exponent, and the correlation length of spectra that have one, with relative deviations.
+
+    Spectra that hardly add to them are left out.
+    """
+    shares = np.where(shares > KEPT, shares, 0.0)
+    shares = shares / shares.sum()
     variance, by_variance = _moments(shares, [each.moments[0] for each in posteriors])
     exponents = np.array([spectrum.term.exponent for spectrum in spectra])
     exponent = float(shares @ exponents)

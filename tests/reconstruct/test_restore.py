@@ -11,6 +11,7 @@ from ommatid.analysis import run_table
 from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.output.result_files import with_estimator_changes
+from ommatid.reconstruct.output.run_json import FittedNumber
 from ommatid.reconstruct.restore import Reconstruction, check_camera, restore
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
@@ -126,4 +127,8 @@ def test_without_the_truth_there_is_no_measured_error() -> None:
     report = report_of(stack, model, blind)
     assert "mse" not in report.plain()["error"]
     assert run_table.rows(report)
+    open_number = {"exponent": FittedNumber(value=1e-25, log_deviation=1e12)}
+    left_open = report.diagnostics.model_copy(update={"fit": open_number})
+    lines = dict(run_table.rows(report.model_copy(update={"diagnostics": left_open})))
+    assert lines["fitted exponent"] == "1e-25, which the stack leaves open"
     assert report.error.predicted_mse > 0

@@ -24,6 +24,8 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.model import RECORDED
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.sensor import FULL_SCALE
@@ -96,7 +98,7 @@ def remedies(stack: Stack, task: EstimationTask) -> dict[str, str]:
     calibrate = f"calibrate H {points}"
     if way == RECORDED:
         calibrate = "record the point sources again, since which the camera has changed"
-    elif way == "ideal" and task.settings.misalignment != "fit":
+    elif way == "ideal" and task.settings.misalignment != "fit" and _serves_fit(stack.camera):
         calibrate += f", or set {tolerance}estimator.misalignment = 'fit'"
     flat = "record the flat frames again" if stack.record.get("flat") else "import with a flat frame (--flat)"
     finer = "raise target.detail" if stack.camera.has_detail else "set target.detail = 2 or more"
@@ -109,6 +111,12 @@ def remedies(stack: Stack, task: EstimationTask) -> dict[str, str]:
         "noise": noise if stack.scene.sensor is None else "measure the read noise and the gain of the [sensor]",
         "detail": f"{finer} with prior.kind = 'fit', or take a smaller target.pixel_pitch",
     }
+
+
+def _serves_fit(camera: Camera) -> bool:
+    """Return True if the misalignments of such a camera can be fitted to a stack."""
+    sharp = camera.has_box_footprints and camera.has_sharp_footprints
+    return sharp and camera.unknowns <= MOST_DENSE and camera.detail == 1
 
 
 @dataclass(frozen=True)
@@ -282,8 +290,9 @@ class _Search:
         """Yield the most likely damaged pixels, and all readings of one of the worst sub-imagers."""
         unit, left, chosen = sparse.eye_array(self.m.size, format="csc"), self.m, list[int]()
         for index in self._worst:
-            columns, where = unit[:, np.flatnonzero(self.of_sub == index)].tocsr(), self._named([index])
-            yield Fault("sub-imager", columns, columns.shape[1], lambda _, where=where: ([], where))
+            error, where = self._error_of(index), self._named([index])
+            count = int((self.of_sub == index).sum())
+            yield Fault("sub-imager", _column(error), count, lambda _, where=where: ([], where), known=True)
         for count in range(1, min(MOST_PIXELS, self.m.size // 10) + 1):
             chosen.append(int(np.argmax(left**2 / self.precision.diagonal())))
             rows = np.array(chosen)
@@ -366,11 +375,15 @@ class _Search:
             excess.append(float(self.m[rows] @ self._on(rows, self.m[rows])) - rows.sum())
         return list(dict.fromkeys([*self.named, *np.argsort(excess)[::-1].tolist()]))[:WORST]
 
+    def _error_of(self, index: int) -> FloatArray:
+        """Return what a sub-imager reads more than all others predict: (measurements used,)."""
+        rows, error = self.of_sub == index, np.zeros(self.m.size)
+        error[rows] = self._on(rows, self.m[rows])
+        return error
+
     def _of_one(self, index: int) -> Iterator[Fault]:
         """Yield the faults of one sub-imager, by the image and the light that the others predict."""
-        rows, where = self.of_sub == index, self._named([index])
-        error = np.zeros(self.m.size)
-        error[rows] = self._on(rows, self.m[rows])
+        rows, where, error = self.of_sub == index, self._named([index]), self._error_of(index)
         effects = self._effects(self.method.image - self.operators.gain(error))
         if self.readings[rows].sum() < DARK * (self.readings - error)[rows].sum():
             del effects["gain"]

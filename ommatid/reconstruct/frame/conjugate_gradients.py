@@ -115,13 +115,20 @@ class FrameSystem:
         pairs = zip(self._types, self.mean_weights, strict=True)
         if all(float(np.ptp(self.weights[part])) <= EVEN * weight for part, weight in pairs):
             return self.bands
-        local, average = self.local_weights
-        relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
-        scale = np.sqrt(np.maximum(relative, LEAST_LOCAL)).reshape(self.shape)
+        scale = np.sqrt(self.levels(lambda image: image)).reshape(self.shape)
         return min((self.bands, replace(self.bands, scale=scale)), key=self._after_trial)
 
+    def levels(self, of: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Return the weights of the measurements of each pixel relative to the means of their lens types.
+
+        of : takes an image of the unknowns to the pixels asked for
+        """
+        local, average = (of(each) for each in self._local_weights)
+        relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
+        return np.maximum(relative, LEAST_LOCAL)
+
     @cached_property
-    def local_weights(self) -> tuple[FloatArray, FloatArray]:
+    def _local_weights(self) -> tuple[FloatArray, FloatArray]:
         """H^T w of the weights, and of their means over each lens type: (N,) each."""
         means = np.repeat(self.mean_weights, [part.stop - part.start for part in self._types])
         return self.observation.adjoint(self.weights), self.observation.adjoint(means)

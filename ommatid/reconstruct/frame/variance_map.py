@@ -35,7 +35,6 @@ LEAST_SHARE = 0.1  # of a variance in the small frame, which that in a large one
 COLUMNS = 128  # readings whose covariances are computed at once
 INTERIOR, EDGES = 9, 4  # levels of noise at which the two are computed; others follow from them
 EVEN, EVEN_EDGES = 1e-3, 0.1  # range of levels, logarithms, that count as one
-LEAST_LEVEL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
 
 Maps = Callable[[float], FloatArray]  # from the logarithm of a level to three maps
 
@@ -92,29 +91,24 @@ def moments(matrix: sparse.csr_array, spectrum: FloatArray, detail: int) -> Mome
     return Moments(pixels, both, (readings + readings.T) / 2)
 
 
-def prior_precision(prior: float | FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Return P0^-1 of a small frame as a matrix, (N, N), from 1 / P0 or 1 / its spectrum under the DCT-II."""
-    if not isinstance(prior, np.ndarray):
-        return prior * np.eye(shape[0] * shape[1])
+def prior_precision(prior: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Return P0^-1 of a small frame as a matrix, (N, N), from 1 / its spectrum under the DCT-II."""
     waves = np.kron(*(np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in shape))
     return np.asarray(waves.T @ (prior.ravel()[:, None] * waves), dtype=np.float64)
 
 
 def precision_map(
-    precision: FloatArray, prior: float | FloatArray, shape: tuple[int, int], ratio: float, excess: FloatArray | None
+    precision: FloatArray, prior: FloatArray, shape: tuple[int, int], ratio: float, excess: FloatArray | None
 ) -> FloatArray:
     """Return the diagonals of C = K^-1, C P0^-1 C and C S C of a small frame: (3, rows, columns).
 
-    precision : (N, N) K;  prior : 1 / P0 or 1 / its spectrum
+    precision : (N, N) K;  prior : 1 / its spectrum
     ratio, excess : S is `ratio` times H^T Rv^-1 H plus `excess`, (N, N), which None leaves out
     """
     factor, _ = factorise_positive(precision)
     covariance = factor.inverse()
-    if isinstance(prior, np.ndarray):
-        spread = np.asarray(fft.dctn(covariance.reshape(*shape, -1), 2, axes=(0, 1), norm="ortho"))
-        missing = np.einsum("rc,rcn->n", prior, np.square(spread))
-    else:
-        missing = prior * np.square(covariance).sum(axis=0)
+    spread = np.asarray(fft.dctn(covariance.reshape(*shape, -1), 2, axes=(0, 1), norm="ortho"))
+    missing = np.einsum("rc,rcn->n", prior, np.square(spread))
     posterior = np.diagonal(covariance)
     noisy = ratio * (posterior - missing)
     if excess is not None:
@@ -276,7 +270,7 @@ def frame_map(task: EstimationTask, system: FrameSystem, bands: Bands, actual: F
     def edges(value: float) -> FloatArray:
         return even.maps(float(np.exp(value)), ratios) / np.maximum(interior(value), np.finfo(float).tiny)
 
-    return by_levels(np.log(levels(task, system)), inside, edges)
+    return by_levels(np.log(system.levels(task.of_f)).reshape(shape), inside, edges)
 
 
 def ways_to_edges(task: EstimationTask, bands: Bands) -> list[bool]:
@@ -308,7 +302,7 @@ def unseen_corners(bands: Bands) -> list[tuple[int, int]]:
 
 def is_uneven(task: EstimationTask, system: FrameSystem) -> bool:
     """Return True if the noise of neighbouring pixels differs."""
-    return float(np.ptp(np.log(levels(task, system)))) > EVEN_EDGES
+    return float(np.ptp(np.log(system.levels(task.of_f)))) > EVEN_EDGES
 
 
 def without_edges(task: EstimationTask, bands: Bands) -> Bands:
@@ -360,13 +354,6 @@ def between(level: FloatArray, most: int, even: float, maps: Maps) -> list[Float
         parts = [share * np.log(np.maximum(each, tiny)) for each in maps(float(value))]
         total = parts if not total else [one + part for one, part in zip(total, parts, strict=True)]
     return [np.exp(each) for each in total]
-
-
-def levels(task: EstimationTask, system: FrameSystem) -> FloatArray:
-    """Return the weights of each pixel's measurements relative to the means of their lens types: (rows, columns)."""
-    local, average = (task.of_f(each) for each in system.local_weights)
-    relative = np.divide(local, average, out=np.ones_like(local), where=average > 0)
-    return np.maximum(relative, LEAST_LEVEL).reshape(task.shape_of_f)
 
 
 def mean_ratios(task: EstimationTask, weights: FloatArray, actual: FloatArray) -> tuple[float, ...]:

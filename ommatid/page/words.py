@@ -52,7 +52,10 @@ def _sentence(words: str) -> str:
 def _error(error: ErrorReport) -> str:
     predicted = sqrt(error.predicted_mse)
     if error.mse is None:
-        return f"The truth is not known; the predicted RMS error of a pixel is {predicted:.3g} {SCALE}."
+        words = f"The truth is not known; the predicted RMS error of a pixel is {predicted:.3g} {SCALE}"
+        given = error.expected_given_estimate
+        least = "" if given is None else f" for images of the prior, and {sqrt(given):.3g} if the image is the estimate"
+        return f"{words}{least}."
     measured = f"The RMS error of a pixel is {sqrt(error.mse):.3g} {SCALE}"
     given = error.expected_given_truth
     if given is None:

@@ -99,7 +99,9 @@ def _error(error: ErrorReport) -> str:
     mse = error.predicted_mse if given is None else given.mse
     interval = "" if given is None else f", 99 %: {given.low:.4g} to {given.high:.4g}"
     if error.mse is None:
-        return f"expected {sqrt(mse):.3g} grey levels RMS (MSE {mse:.4g}); the truth is not known"
+        alike = error.expected_given_estimate
+        least = "" if alike is None else f" for images of the prior, {sqrt(alike):.3g} if the image is the estimate"
+        return f"expected {sqrt(mse):.3g} grey levels RMS (MSE {mse:.4g}){least}; the truth is not known"
     measured = f"{sqrt(error.mse):.3g} grey levels RMS (MSE {error.mse:.4g})"
     return f"{measured}, expected {sqrt(mse):.3g} (MSE {mse:.4g}{interval})"
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -21,12 +22,13 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .assumptions import Assumptions, assumptions_for, with_fallback
+from .detail.detailed_model import CAUSE as DETAIL
 from .detail.detailed_model import DetailedModel, DetailMethod
 from .expected_error import ExpectedError, Interval
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
 from .methods.method import EstimationTask, Execution, Method, MethodResult, Prepared, is_uniform, total_variance
-from .misalignment.robust_noise import CAUSE
+from .misalignment.robust_noise import CAUSE as MISALIGNMENT
 from .noise import Noise, UsablePixels, undithered, uniform
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
 from .prior_fit import PriorFit
@@ -141,7 +143,7 @@ def _largest_ratio(total: FloatArray, expected: FloatArray) -> float:
 
 def _shared(model: Model, assumed: Assumptions, total: FloatArray, result: MethodResult) -> FloatArray:
     """Return the share of the noise that a few errors per sub-imager cause: a fitted geometry, or misalignment."""
-    if CAUSE in result.expected.parts and result.interval is None:
+    if MISALIGNMENT in result.expected.parts and result.interval is None:
         return np.ones(total.size)
     if not model.record.get("fit") or "calibration" not in assumed.noise:
         return uniform(0.0, total.size)
@@ -153,6 +155,7 @@ class Reconstruction:
     """An estimate with its expected error (Eq. 5), and its measured error where the truth is known.
 
     prior : as assumed, fitted or described;  noise : variances by cause, (pixels used,) each
+    given_estimate : computes the mean squared error to expect if the image is the estimate, None where that is unknown
     spurious_information : mean share of a pixel's apparent information that the noise of H may have produced
     task : what the estimator was given, H and the expected noise included
     """
@@ -162,6 +165,7 @@ class Reconstruction:
     prior: PriorTable
     trimmed_mse: float | None
     residual: ResidualReport | None
+    given_estimate: Callable[[], float | None]
     shape: tuple[int, int]
     usable: UsablePixels
     noise: Noise
@@ -274,7 +278,8 @@ def _restored(
         choice=choice,
         prior=assumed.prior,
         trimmed_mse=trimmed_mean(result.expected.variance, shape),
-        residual=None if whole is None else _residual(whole, assumed, result.expected.degrees_of_freedom),
+        residual=None if whole is None else ResidualReport.model_validate(whole),
+        given_estimate=partial(_given_estimate, assumed.method, result.expected),
         shape=shape,
         usable=assumed.usable,
         noise=assumed.noise,
@@ -301,12 +306,17 @@ def _image(truth: FloatArray, camera: Camera) -> FloatArray:
     return averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
 
 
-def _residual(whole: ResidualPart, assumed: Assumptions, degrees_of_freedom: float) -> ResidualReport:
-    """Return chi-squared beside what it would be if the noise were as expected."""
-    expected = whole.prior
-    if not np.allclose(total_variance(assumed.noise), assumed.method.task.expected_noise, rtol=1e-9):
-        expected = max(whole.measurements - degrees_of_freedom, 0.0)
-    return ResidualReport(chi_squared=whole.chi_squared, expected=expected, deviation=(2 * expected) ** 0.5)
+def _given_estimate(method: Method, expected: ExpectedError) -> float | None:
+    """Return the mean squared error to expect if the image is the estimate; None where no operators are known.
+
+    It is |(I - A H)(f^ - f0)|^2 + trace(A Rvm A^T), over N, as for a known image.
+    """
+    operators = method.operators()
+    if operators is None:
+        return None
+    bias = method.task.of_f(operators.hidden(method.image - method.mean))
+    noisy = sum(part for cause, part in expected.parts.items() if cause != DETAIL or method.task.finer == 1)
+    return float(np.square(bias).mean()) + noisy
 
 
 def _spurious_information(task: EstimationTask, expected: ExpectedError) -> FloatArray:

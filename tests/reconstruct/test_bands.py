@@ -55,7 +55,7 @@ def camera() -> tuple[Bands, Array, list[Array]]:
         kernel = rng.random((side, side))
         kernel = (kernel + kernel[::-1]) / 2
         kernels.append((kernel + kernel[:, ::-1]) / 2 / side)
-    types = (Readings(kernels[0], (-1, 2), SHAPE), Readings(kernels[1], (0, 0), SHAPE))
+    types = (Readings(kernels[0][None], (-1, 2), SHAPE), Readings(kernels[1][None], (0, 0), SHAPE))
     weights, readings = (2.0, 0.7), [continued(kernels[0], True), continued(kernels[1], False)]
     waves = np.kron(*(fft.dct(np.eye(size), 2, axis=0, norm="ortho") for size in spectrum.shape))
     precision = waves.T @ np.diag(1 / spectrum.ravel()) @ waves
@@ -93,7 +93,9 @@ def test_strips_mend_the_edges() -> None:
     fine = shape[0] * detail, shape[1] * detail
     types = tuple(
         Readings(
-            np.full((side * detail,) * 2, (side * detail) ** -2.0), (0, 0), (shape[0] - side + 1, shape[1] - side + 1)
+            np.full((1, side * detail, side * detail), (side * detail) ** -2.0),
+            (0, 0),
+            (shape[0] - side + 1, shape[1] - side + 1),
         )
         for side in (2, 3, 4)
     )

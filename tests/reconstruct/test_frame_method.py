@@ -69,6 +69,18 @@ CASES = {
 }
 
 
+def test_without_a_truth_the_expectation_is_that_of_an_image_like_the_estimate() -> None:
+    """As for this image as the truth, by another solution of the dense problem."""
+    scene = wide(SMALL, FITTED, **CASES["exact H, other expected noise"][0])
+    model, stack = ideal_model(scene, derive(scene)), recorded(scene, drawn(SMALL, 0), VARIANCE)
+    dense, frame = both(stack, model, None)
+    known = restored_by("auto", stack, model, dense.estimate)
+    assert known.interval is not None
+    assert dense.given_estimate() == pytest.approx(known.interval.mse, rel=1e-8)
+    assert frame.given_estimate() == pytest.approx(known.interval.mse, rel=1e-2)  # its map of the noise
+    assert known.interval.mse < dense.expected.mse
+
+
 @pytest.mark.parametrize(
     ("case", "shape"),
     [

@@ -25,11 +25,11 @@ mean.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from math import ceil
+from math import ceil, floor
 
 import numpy as np
 from scipy import fft, sparse
@@ -43,44 +43,47 @@ from ommatid.scenes.observation import Observation
 
 DEPTH = 16  # pixels of f of a strip
 CORNER = 32  # pixels of the world along the side of a corner, at most
+LEAST_PART = 1e-3  # of the power of the strongest kernel of boxes that begin at fractions of a pixel
 LEAST = 1e-12  # of the eigenvalues of a strip's correction, relative to the largest
 
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings one pixel of f apart, along both axes, by a kernel of the world's pixels.
+    """Readings one pixel of f apart, along both axes, by a kernel of the world's pixels, or by several.
 
-    kernel : (rows, columns);  first : row and column of the world where that of the first reading begins
+    Where readings begin at fractions of a pixel, no one kernel is theirs: the mean of K's terms over these fractions is
+    that of several kernels, each even or odd along either axis.
+
+    kernels : (parts, rows, columns);  first : row and column of the world where those of the first reading begin
     count : readings down and across
     """
 
-    kernel: FloatArray
+    kernels: FloatArray
     first: tuple[int, int]
     count: tuple[int, int]
 
-    @cached_property
-    def even(self) -> FloatArray:
-        """The mean of the kernel and its mirror images."""
-        upright = (self.kernel + self.kernel[::-1]) / 2
-        return (upright + upright[:, ::-1]) / 2
+    @property
+    def extent(self) -> tuple[int, int]:
+        """Rows and columns of a kernel."""
+        return self.kernels.shape[1], self.kernels.shape[2]
 
     def is_odd(self, axis: int, detail: int) -> bool:
         """Return True if the middles of readings are those of pixels of f, False if they are edges between these."""
-        return round((2 * self.first[axis] + self.kernel.shape[axis]) / detail) % 2 == 1
+        return round((2 * self.first[axis] + self.extent[axis]) / detail) % 2 == 1
 
     def matrix(self, shape: tuple[int, int], detail: int) -> sparse.csr_array:
-        """Return the readings as a matrix on a world of this shape: (readings, its pixels)."""
+        """Return the readings as a matrix on a world of this shape: (parts times readings, its pixels)."""
         places: list[IntArray] = [
             (first + detail * np.arange(count))[:, None] + np.arange(length)
-            for first, count, length in zip(self.first, self.count, self.kernel.shape, strict=True)
+            for first, count, length in zip(self.first, self.count, self.extent, strict=True)
         ]
         down, across = places[0][:, None, :, None], places[1][None, :, None, :]
         inside = (down >= 0) & (down < shape[0]) & (across >= 0) & (across < shape[1])
-        inside = inside & (self.kernel != 0)
+        inside = inside & (self.kernels != 0)[:, None, None]
         pixels = np.broadcast_to(down * shape[1] + across, inside.shape)[inside]
-        values = np.broadcast_to(self.kernel, inside.shape)[inside]
-        pointers = np.concatenate([[0], np.cumsum(inside.sum(axis=(2, 3)).ravel())])
-        size = self.count[0] * self.count[1], shape[0] * shape[1]
+        values = np.broadcast_to(self.kernels[:, None, None], inside.shape)[inside]
+        pointers = np.concatenate([[0], np.cumsum(inside.sum(axis=(3, 4)).ravel())])
+        size = len(self.kernels) * self.count[0] * self.count[1], shape[0] * shape[1]
         return sparse.csr_array((values, pixels, pointers), shape=size)
 
     def shortened(self, by: tuple[int, int]) -> Readings:
@@ -104,21 +107,30 @@ class Bands:
     scale: FloatArray | float = field(default=1.0, repr=False)  # S of the precision S K S, (F rows, F columns)
 
     @cached_property
-    def _rows(self) -> tuple[FloatArray, ...]:
-        """b_t of each lens type: (F rows, F columns)."""
-        return tuple(self._row(each) for each in self.types)
+    def _rows(self) -> list[FloatArray]:
+        """b_t of the kernels of all lens types: (F rows, F columns) each."""
+        return [row for each in self.types for row in self._rows_of(each)]
+
+    def _of_rows(self, values: Sequence[float]) -> FloatArray:
+        """Return the value of the lens type of each row b_t."""
+        return np.repeat(values, [len(each.kernels) for each in self.types])
 
     @cached_property
     def _pixels(self) -> FloatArray:
         """a, of the averages over pixels of f: (F rows, F columns)."""
-        return self._row(Readings(np.full((self.detail, self.detail), self.detail**-2.0), (0, 0), self.shape))
+        average = np.full((1, self.detail, self.detail), self.detail**-2.0)
+        return next(self._rows_of(Readings(average, (0, 0), self.shape)))
 
-    def _row(self, readings: Readings) -> FloatArray:
-        """Return the transfer function of readings with the signs and the norms of the aliases."""
-        lengths = readings.kernel.shape
-        waves = [_waves(size, self.detail, length) for size, length in zip(self.shape, lengths, strict=True)]
-        norms = [_norms(size, self.detail, readings.is_odd(axis, self.detail)) for axis, size in enumerate(self.shape)]
-        return norms[0][:, None] * (waves[0] @ readings.even @ waves[1].T) * norms[1]
+    def _rows_of(self, readings: Readings) -> Iterator[FloatArray]:
+        """Yield the transfer function of each kernel of readings with the signs and the norms of the aliases."""
+        for kernel in readings.kernels:
+            down, across = (self._along(readings, axis, _is_turned(kernel, axis)) for axis in (0, 1))
+            yield down @ kernel @ across.T
+
+    def _along(self, readings: Readings, axis: int, turned: bool) -> FloatArray:
+        """Return the transfer function along an axis of each line of a kernel: (waves, lines)."""
+        norms = _norms(self.shape[axis], self.detail, readings.is_odd(axis, self.detail), turned)
+        return norms[:, None] * _waves(self.shape[axis], self.detail, readings.extent[axis], turned)
 
     @cached_property
     def _spectral(self) -> tuple[FloatArray, FloatArray]:
@@ -126,7 +138,7 @@ class Bands:
 
         Where all types see a wave of large variance alike, the inverse of the matrix itself would have no digits.
         """
-        rows, roots = self._rows, np.sqrt(np.array(self.weights))
+        rows, roots = self._rows, np.sqrt(self._of_rows(self.weights))
         inner = np.empty((self.shape[0] + 1, self.shape[1] + 1, len(rows), len(rows)))
         for one, first in enumerate(rows):
             weighted = self.spectrum * first
@@ -157,7 +169,8 @@ class Bands:
         """Eigenvalues of M^-1 where each group has one wave: (rows, columns)."""
         seen = np.zeros(self.shape)
         for readings, weight in zip(self.types, self.weights, strict=True):
-            seen += weight * np.square(self._row(readings))
+            for row in self._rows_of(readings):
+                seen += weight * np.square(row)
         return self.spectrum / (1 + self.spectrum * seen)
 
     def _subtract_seen(self, waves: FloatArray) -> None:
@@ -193,12 +206,15 @@ class Bands:
             for total in (seen, whole):
                 total[:, :, number, :, number] = priors[:, number]
         for readings, weight in zip(self.types, self.weights, strict=True):
-            along = self._along(readings, axis)[members]
-            along[members < 0] = 0.0
             for total, complete in ((seen, False), (whole, True)):
                 shares = _shares(readings, axis, size, detail, part, complete=complete)
-                values = np.einsum("pxa,kla->kpxl", shares, along, optimize=True).reshape(len(members), len(shares), -1)
-                total += (weight * values.swapaxes(1, 2) @ values).reshape(total.shape)
+                for kernel in readings.kernels:
+                    lines = kernel if axis == 0 else kernel.T
+                    along = (self._along(readings, 1 - axis, _is_turned(kernel, 1 - axis)) @ lines.T)[members]
+                    along[members < 0] = 0.0
+                    values = np.einsum("pxa,kla->kpxl", shares, along, optimize=True)
+                    values = values.reshape(len(members), len(shares), -1)
+                    total += (weight * values.swapaxes(1, 2) @ values).reshape(total.shape)
         return _Edge(axis, part, members, seen, whole)
 
     @cached_property
@@ -229,17 +245,11 @@ class Bands:
                 _shares(readings, axis, self.shape[axis], self.detail, part, complete=False)
                 for axis, part in enumerate((rows, columns))
             ]
-            read = np.einsum("rxa,ab,syb->rsxy", shares[0], readings.even, shares[1], optimize=True)
-            read = read.reshape(-1, tall * wide)
-            total += weight * read.T @ read
+            for kernel in readings.kernels:
+                read = np.einsum("rxa,ab,syb->rsxy", shares[0], kernel, shares[1], optimize=True)
+                read = read.reshape(-1, tall * wide)
+                total += weight * read.T @ read
         return total
-
-    def _along(self, readings: Readings, axis: int) -> FloatArray:
-        """Return the transfer function along an edge of each line of a kernel across it: (waves, lines)."""
-        kernel = readings.even if axis == 0 else readings.even.T
-        size = self.shape[1 - axis]
-        norms = _norms(size, self.detail, readings.is_odd(1 - axis, self.detail))
-        return norms[:, None] * (_waves(size, self.detail, kernel.shape[1]) @ kernel.T)
 
     def variances(self, level: float, ratios: tuple[float, ...]) -> tuple[float, float, float]:
         """Return the posterior variance of a pixel of f far from the edges, and the parts of Eq. 5 by prior and noise.
@@ -251,10 +261,10 @@ class Bands:
         posterior = before - level * np.einsum("iju,iju->ij", along, seen)
         gain = np.einsum("ijtu,iju->ijt", vectors, along) * level
         # The noise of a type, 1 / w, passes through its gain; both are finite for a weight of 0.
-        weights = level * np.array(self.weights)
+        weights = level * self._of_rows(self.weights)
         noise = np.divide(np.square(gain), weights, out=np.zeros_like(gain), where=weights > 0)
         total, missing = posterior.mean(), (posterior - noise.sum(axis=-1)).mean()
-        return float(total), float(missing), float((noise @ np.array(ratios)).mean())
+        return float(total), float(missing), float((noise @ self._of_rows(ratios)).mean())
 
     @cached_property
     def _of_pixels(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -302,29 +312,51 @@ def bands_of(camera: Camera, detail: int, spectrum: FloatArray, weights: FloatAr
     types: list[Readings] = []
     means: list[float] = []
     for lens_type, rows in zip(camera.types, camera.type_slices(), strict=True):
-        kernel = _box(float(lens_type.ratio)) if lens_type.name not in parts else parts[lens_type.name].mean_kernel
-        readings = _readings(lens_type, kernel, detail)
+        kernel = None if lens_type.name not in parts else parts[lens_type.name].mean_kernel
+        readings = _boxes(lens_type, detail) if kernel is None else _kernels(lens_type, kernel, detail)
         taken = lens_type.measurements / (readings.count[0] * readings.count[1])
         types.append(readings)
         means.append(float(weights[rows].mean()) * taken)
     return Bands((camera.rows // detail, camera.columns // detail), detail, spectrum, tuple(types), tuple(means))
 
 
-def _readings(lens_type: LensType, kernel: FloatArray, detail: int) -> Readings:
-    """Return the readings of all boxes one pixel of f apart in the field of a lens type."""
+def _kernels(lens_type: LensType, kernel: FloatArray, detail: int) -> Readings:
+    """Return the readings by a kernel, and its mirror images, one pixel of f apart in the field of a lens type."""
     first, count = list[int](), list[int]()
     for (start, end), length in zip(lens_type.bounds, kernel.shape, strict=True):
         first.append(round(float(start) + (float(lens_type.ratio) - length) / 2))
         count.append(max(round((float(end - start) - float(lens_type.ratio)) / detail) + 1, 1))
-    return Readings(kernel, (first[0], first[1]), (count[0], count[1]))
+    upright = kernel + kernel[::-1]
+    return Readings((upright + upright[:, ::-1])[None] / 4, (first[0], first[1]), (count[0], count[1]))
 
 
-def _box(ratio: float) -> FloatArray:
-    """Return the mean over a box of this side: (rows, columns)."""
-    side = ceil(ratio)
-    share = np.full(side, 1 / ratio)
-    share[[0, -1]] = (1 - (side - 2) / ratio) / 2 if side > 1 else 1.0
-    return np.outer(share, share)
+def _boxes(lens_type: LensType, detail: int) -> Readings:
+    """Return the readings by boxes one pixel of f apart, by kernels of their mean power where places are fractions."""
+    ratio, axes = lens_type.ratio, list[FloatArray]()
+    first, count = list[int](), list[int]()
+    for axis, (start, end) in enumerate(lens_type.bounds):
+        first.append(floor(start))
+        count.append(max(floor((end - ratio - first[axis]) / detail) + 1, 1))
+        views = product(lens_type.starts(axis), range(lens_type.pixels[axis]))
+        axes.append(_mean_power(float(ratio), [float((view + ratio * n - first[axis]) % detail) for view, n in views]))
+    kernels = np.einsum("ax,by->abxy", *axes).reshape(-1, axes[0].shape[1], axes[1].shape[1])
+    power = np.square(kernels).sum(axis=(1, 2))
+    return Readings(kernels[power > LEAST_PART * power.max()], (first[0], first[1]), (count[0], count[1]))
+
+
+def _mean_power(ratio: float, starts: list[float]) -> FloatArray:
+    """Return even and odd lines, the sum of whose powers is the mean of that of boxes: (lines, pixels)."""
+    places, counts = np.unique(np.round(starts, 9), return_counts=True)
+    edges = np.arange(ceil(float(places.max()) + ratio) + 1.0)
+    shares: FloatArray = np.diff(np.minimum(np.maximum(edges - places[:, None], 0.0), ratio)) / ratio
+    shares *= np.sqrt(counts / counts.sum())[:, None]
+    parts = [np.linalg.svd((shares + sign * shares[:, ::-1]) / 2, full_matrices=False) for sign in (1, -1)]
+    return np.concatenate([values[:, None] * vectors for _, values, vectors in parts])
+
+
+def _is_turned(kernel: FloatArray, axis: int) -> bool:
+    """Return True if a kernel is odd along an axis."""
+    return bool(np.vdot(kernel, np.flip(kernel, axis)) < 0)
 
 
 def _members(size: int, detail: int) -> IntArray:
@@ -341,7 +373,7 @@ def _shares(readings: Readings, axis: int, size: int, detail: int, part: slice, 
 
     complete : True for readings that continue beyond the edges, where they see the world reflected
     """
-    length, end = readings.kernel.shape[axis], size * detail
+    length, end = readings.extent[axis], size * detail
     starts: IntArray = readings.first[axis] + detail * np.arange(readings.count[axis])
     roots = np.ones(starts.size)
     if complete:
@@ -443,18 +475,26 @@ def _segments(size: int, detail: int) -> Iterator[tuple[slice, slice]]:
         yield part, slice(0, size) if number % 2 == 0 else slice(size, 0, -1)
 
 
-def _waves(size: int, detail: int, length: int) -> FloatArray:
-    """Return the cosines of all waves of the world about the middle of `length` of its pixels: (F size, length)."""
+def _waves(size: int, detail: int, length: int, turned: bool) -> FloatArray:
+    """Return the cosines of all waves of the world about the middle of `length` of its pixels: (F size, length).
+
+    turned : the sines in place of the cosines
+    """
     angles = np.pi * np.arange(size * detail) / (size * detail)
-    return np.cos(np.outer(angles, np.arange(length) - (length - 1) / 2))
+    phases = np.outer(angles, np.arange(length) - (length - 1) / 2)
+    return np.sin(phases) if turned else np.cos(phases)
 
 
-def _norms(size: int, detail: int, odd: bool) -> FloatArray:
-    """Return the sign of each wave as readings see it, times the root of its norm on them: (F size,)."""
+def _norms(size: int, detail: int, odd: bool, turned: bool) -> FloatArray:
+    """Return the sign of each wave as readings see it, times the root of its norm on them: (F size,).
+
+    turned : they see its sine, which vanishes where the cosine does not
+    """
     number, place = np.divmod(np.arange(size * detail), size)
     turns = (number + 1) // 2  # by which the wave of the readings is shifted
     norms = np.full(size * detail, detail**-0.5)
     zero, highest = (place == 0) & (number % 2 == 0), (place == 0) & (number % 2 == 1)
-    norms[zero & (number > 0)] = (2 / detail) ** 0.5
-    norms[highest] = 0.0 if odd else (2 / detail) ** 0.5
-    return np.where(odd & (turns % 2 == 1), -norms, norms)
+    norms[zero & (number > 0)] = 0.0 if turned else (2 / detail) ** 0.5
+    norms[highest] = 0.0 if odd != turned else (2 / detail) ** 0.5
+    norms = np.where(odd & (turns % 2 == 1), -norms, norms)
+    return np.where(turned & (number % 2 == 1), -norms, norms)

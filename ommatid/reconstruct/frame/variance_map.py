@@ -217,7 +217,7 @@ class Strips:
     @classmethod
     def of(cls, task: EstimationTask, bands: Bands, prior: float) -> Strips:
         """Return those of a task's frame; prior : 1 / P0."""
-        deep = DEEP * max(max(each.kernel.shape) for each in bands.types)
+        deep = DEEP * max(max(each.extent) for each in bands.types)
         rows, columns = bands.shape
         left, top = (rows, min(2 * deep, columns)), (min(2 * deep, rows), columns)
         along = tuple(SmallFrame(_with_shape(bands, task, each)) for each in (left, top))
@@ -245,7 +245,7 @@ class Strips:
         pixels = (numbers if axis == 1 else numbers.T)[:, lines]
         matrix = sparse.csr_array(sparse.vstack(frame.matrices, format="csr"))[:, pixels.ravel()]
         weights, every = (frame.of_readings(np.array(each)) for each in (frame.like.weights, ratios))
-        reach = max(max(each.kernel.shape) for each in frame.like.types)
+        reach = max(max(each.extent) for each in frame.like.types)
         return swept_maps(matrix, level * weights, every, self.prior, pixels.shape, reach)
 
 
@@ -292,9 +292,7 @@ def unseen_corners(bands: Bands) -> list[tuple[int, int]]:
     """Return the corner pixels of f, (row, column), where two edges meet that some lens types do not see."""
     ends: list[list[int]] = []
     for axis, size in enumerate(bands.shape):
-        seen = [
-            (each.first[axis], bands.detail * (each.count[axis] - 1) + each.kernel.shape[axis]) for each in bands.types
-        ]
+        seen = [(each.first[axis], bands.detail * (each.count[axis] - 1) + each.extent[axis]) for each in bands.types]
         unseen = any(first > 0 for first, _ in seen), any(sum(each) < size * bands.detail for each in seen)
         ends.append([place for place, missing in zip((0, size - 1), unseen, strict=True) if missing])
     return list(product(*ends))  # type: ignore[arg-type]

@@ -98,6 +98,8 @@ def _error(restoration: Reconstruction, stack: Stack) -> ErrorReport:
         measured["gain"] = None if psnr is None or single.psnr is None else psnr - single.psnr
     if restoration.interval is not None:
         measured["expected_given_truth"] = IntervalReport.model_validate(restoration.interval)
+    if restoration.error is None and (given := restoration.given_estimate()) is not None:
+        measured["expected_given_estimate"] = given
     return ErrorReport(
         **measured,
         predicted_mse=restoration.expected.mse,

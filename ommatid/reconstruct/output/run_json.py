@@ -137,6 +137,8 @@ class ErrorReport(Record):
     """Measured and predicted error; `budget` holds the parts of `predicted_mse` by cause.
 
     gain : dB of `psnr` over that of the baseline, None if one of them is exact
+    predicted_mse : for images of the prior;  expected_given_truth, expected_given_estimate : if the image is this one,
+        the latter where the truth is not known
     """
 
     mse: Amount | None = None
@@ -149,12 +151,13 @@ class ErrorReport(Record):
     predicted_trimmed_mse: Amount | None = None
     budget: dict[str, float]
     expected_given_truth: IntervalReport | None = None
+    expected_given_estimate: Amount | None = None
 
 
 class ResidualReport(Record):
-    """Chi-squared of the residual g - H f^ with the expected noise, and its expectation if the noise is that.
+    """Chi-squared of the residual g - H f^ of all measurements, its expectation and standard deviation.
 
-    expected : for images drawn from the prior, M - trace(A H);  deviation : upper bound of the standard deviation
+    They are those of the verdict's first part.
     """
 
     chi_squared: float

@@ -16,7 +16,7 @@ from ommatid.reconstruct.held_out.block_errors import BlockErrors, block_errors
 from ommatid.reconstruct.held_out.check import check_held_out, log_survival
 from ommatid.reconstruct.misalignment.robust_noise import misaligned_matrix
 from ommatid.reconstruct.output.run_json import HeldOutReport
-from ommatid.reconstruct.prior import exponential, independent
+from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
@@ -28,7 +28,7 @@ from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import render
 
-from ..examples import GALLERY, THREE, familywise, scene
+from ..examples import GALLERY, PAIR, THREE, familywise, scene
 from ..frames import P0, recorded, wide
 
 SMALL = (("1/3", [3, 3], [3, 3]), ("1/4", [4, 4], [2, 2]))
@@ -98,7 +98,9 @@ def test_a_sub_imager_of_one_pixel_errs_by_the_error_of_its_prediction() -> None
     described = scene((12, 12), (*SMALL[:1], ("1/4", [2, 2], [1, 1])), **NOISE)
     camera = derive(described)
     stack = recorded(described, draw(camera), 1e-2)
-    problem = Problem(ideal_matrix(camera), independent(127.5, P0, 144), np.full(camera.measurements, 1e-2))
+    root = np.hstack([P0**0.5 * np.eye(144), np.full((144, 1), described.prior.level_deviation)])
+    prior = Prior(np.full(144, 127.5), root)
+    problem = Problem(ideal_matrix(camera), prior, np.full(camera.measurements, 1e-2))
     error, precision, _ = exact_prediction(problem, stack.values, blocks_of(camera)[-1])
     entry = check_held_out(stack, ideal_model(described, camera), fitted=False).sub_imagers[-1]
     assert entry.rms_error == pytest.approx(abs(error[0]), rel=1e-8)
@@ -202,6 +204,24 @@ def test_what_is_right_is_trusted_on_a_photograph(name: str) -> None:
     assert check.verdict.trusted
     assert check.p_value is not None
     assert check.p_value > 1e-4
+
+
+@pytest.mark.parametrize("noise", [1.0, pytest.param(100.0, marks=pytest.mark.slow)])
+def test_pictures_of_any_level_are_predicted_as_well_as_stated(noise: float) -> None:
+    """Twenty draws of the prior with levels, and a dark and a bright picture by a fitted prior."""
+    described = scene(lenses=PAIR, noise={"variance": noise}, prior={"kind": "independent", "variance": 200.0})
+    camera, total, freedoms = derive(described), 0.0, 0.0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        drawn_image = rng.normal(127.5, 64.0) + rng.normal(0.0, 200.0**0.5, camera.unknowns)
+        check = checked(described, ideal_matrix(camera), drawn_image, seed=seed)
+        total += sum(entry.chi_squared for entry in check.sub_imagers)
+        freedoms += sum(entry.expected for entry in check.sub_imagers)
+        assert check.verdict.trusted
+    assert total == pytest.approx(freedoms, rel=0.04)
+    for level in (4.0, 250.0):
+        flat = np.random.default_rng(0).normal(level, 1.0, camera.unknowns)
+        assert checked(described, ideal_matrix(camera), flat, fitted=True).verdict.trusted
 
 
 @pytest.mark.slow

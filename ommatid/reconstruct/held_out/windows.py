@@ -6,7 +6,7 @@ squares of different windows are independent where the pixels of the prior are, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise, product
@@ -134,7 +134,8 @@ def _whole_detailed(task: EstimationTask) -> WindowProblem:
         raise TypeError("expected a model with the covariance of its detail")
     prior, matrix = task.prior_on(task.shape), model.matrix[used]
     root: FloatArray = matrix @ (np.diag(prior.root) if prior.independent else prior.root)
-    covariance = root @ root.T + model.detail_covariance[np.ix_(used, used)]
+    level = matrix.sum(axis=1) * task.prior.level_deviation
+    covariance = root @ root.T + np.outer(level, level) + model.detail_covariance[np.ix_(used, used)]
     noise, directions = task.expected_noise, task.shared_directions
     if directions is not None:
         covariance += (directions @ directions.T).toarray()
@@ -154,25 +155,27 @@ def _whole_robust(task: EstimationTask) -> WindowProblem:
 def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProblem]:
     """Yield the problem of every window, one at a time to bound memory.
 
-    Errors of few numbers of H, which measurements of a sub-imager share, are unknowns of variance 1 beside the pixels.
-    So a sub-imager whose readings are all off by what the numbers allow does not disagree with the others.
+    The level of the image, and errors of few numbers of H, which measurements of a sub-imager share, are unknowns of
+    variance 1 beside the pixels. So a sub-imager whose readings are all off by what the numbers allow does not disagree
+    with the others.
     """
     camera, used, prior_on = task.model.camera, np.flatnonzero(task.used), cache(task.prior_on)
     directions = None if task.shared_directions is None else sparse.csr_array(task.shared_directions)
     for rows, columns in chosen:
         window = task.window(rows, columns)
-        matrix, prior, noise = window.matrix, prior_on(window.shape), window.expected_noise
-        if directions is not None:
-            matrix, prior = _with_unknowns(matrix, prior, sparse.csc_array(directions[window.index]))
-            noise = without_shared(task)[window.index]
+        noise = window.expected_noise if directions is None else without_shared(task)[window.index]
+        level = window.matrix.sum(axis=1)[:, None] * task.prior.level_deviation
+        unknowns = [sparse.csc_array(level), *([] if directions is None else [directions[window.index]])]
+        matrix, prior = _with_unknowns(window.matrix, prior_on(window.shape), unknowns)
         sub_imager = _sub_imager_of(camera, used[window.index])
         yield WindowProblem(Problem(matrix, prior, noise), window.recorded, sub_imager, len(camera.sub_imagers))
 
 
 def _with_unknowns(
-    matrix: sparse.csr_array, prior: Prior, directions: sparse.csc_array
+    matrix: sparse.csr_array, prior: Prior, parts: Sequence[sparse.csc_array | sparse.csr_array]
 ) -> tuple[sparse.csr_array, Prior]:
-    """Return H and the prior with an unknown of variance 1 for every column of L, (m, q), that is not 0."""
+    """Return H and the prior with an unknown of variance 1 for every column of L, (m, q) in parts, that is not 0."""
+    directions = sparse.csc_array(sparse.hstack(parts, format="csc"))
     directions = directions[:, np.flatnonzero(np.diff(directions.indptr))]
     count = directions.shape[1]
     if prior.independent:

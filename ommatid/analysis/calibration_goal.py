@@ -36,9 +36,9 @@ def for_stack(stack: Stack) -> StoppingRule:
         bound = _bound(model, used, total_variance(known_noise(stack))[used])
         if bound is not None:
             return bound
-        restoration = restore(stack, model)
+        restoration = restore(stack, model, quick=True)
         certain = model.without_uncertainty
-        return _added(restoration.noise, restoration.expected, lambda: restore(stack, certain).expected.mse)
+        return _added(restoration.noise, restoration.expected, lambda: restore(stack, certain, quick=True).expected.mse)
 
     made_from = ["stack", digest(stack.values, stack.variance), _tables(stack.scene)]
     return StoppingRule(added_error, fingerprint(made_from), "the error budget of this stack")
@@ -91,7 +91,7 @@ def for_prior(setup: Setup) -> StoppingRule:
                 scene.prior_ratio,
                 finer=model.camera.rows // camera.rows,
             )
-            return method(task, Execution()).result(noise, None).expected
+            return method(task, Execution(quick=True)).result(noise, None).expected
 
         certain = {name: values for name, values in causes.items() if name != "calibration"}
         return _added(causes, expected(causes), lambda: expected(certain).mse)

@@ -341,7 +341,9 @@ def _boxes(lens_type: LensType, detail: int) -> Readings:
         axes.append(_mean_power(float(ratio), [float((view + ratio * n - first[axis]) % detail) for view, n in views]))
     kernels = np.einsum("ax,by->abxy", *axes).reshape(-1, axes[0].shape[1], axes[1].shape[1])
     power = np.square(kernels).sum(axis=(1, 2))
-    return Readings(kernels[power > LEAST_PART * power.max()], (first[0], first[1]), (count[0], count[1]))
+    # In front of a finer world every kernel would be one row more in every group: the strongest one serves.
+    strong = power >= (LEAST_PART if detail == 1 else 1.0) * power.max()
+    return Readings(kernels[strong], (first[0], first[1]), (count[0], count[1]))
 
 
 def _mean_power(ratio: float, starts: list[float]) -> FloatArray:

@@ -27,7 +27,7 @@ from ..methods.method import EstimationTask
 from .conjugate_gradients import BandedSystem, FrameSystem, NotReachedError, leaves_null_space
 from .swept import swept_maps
 from .variance_map import VarianceMap, frame_map, is_narrow, is_uneven, unseen_corners, ways_to_edges
-from .windows import HALO, LONG_HALO, VARYING, Windows, by_windows, windows_map
+from .windows import HALOS, VARYING, Windows, by_windows, windows_map
 
 Pixels = NDArray[np.intp]
 
@@ -130,8 +130,11 @@ class ErrorMap:
     prior: FloatArray | float
 
 
-def error_map(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> ErrorMap:
-    """Return the map of the estimator that `system` is; actual : (measurements used,) noise."""
+def error_map(task: EstimationTask, system: FrameSystem, actual: FloatArray, *, quick: bool = False) -> ErrorMap:
+    """Return the map of the estimator that `system` is.
+
+    actual : (measurements used,) noise;  quick : True leaves out the slow maps, though others are rough
+    """
     prior = task.prior.variance if system.bands is None else system.bands.prior_variance
     if _is_small(task, actual.size):
         whole = Windows(task, actual, task.shape_of_f).map(task.model.applied, (0, 0))
@@ -142,7 +145,7 @@ def error_map(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> 
     exact = ExactVariances(system, noise, task.settings.accuracy, task)
     local = isinstance(system.prior, float) and not leaves_null_space(task.model.camera)
     found: list[ErrorMap] = []
-    for maps in _maps(task, system, actual):
+    for maps in _maps(task, system, actual, HALOS[:1] if quick else HALOS):
         check = check_map(maps.variance, maps.posterior.ravel(), task.shape_of_f, exact, local=local)
         found.append(ErrorMap(maps, check, prior))
         if check.worst <= ROUGH:
@@ -155,8 +158,10 @@ def _is_small(task: EstimationTask, readings: int) -> bool:
     return few and max(task.shape_of_f) <= MOST_EXACT
 
 
-def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iterator[VarianceMap]:
-    """Yield maps from the fastest to the most accurate one."""
+def _maps(
+    task: EstimationTask, system: FrameSystem, actual: FloatArray, halos: tuple[int, ...]
+) -> Iterator[VarianceMap]:
+    """Yield maps from the fastest to the most accurate one; halos : of windows."""
     if isinstance(system, BandedSystem):
         ratios = task.on_all_measurements(actual / task.expected_noise, 0.0)
         prior, reach = float(np.asarray(system.prior)), task.model.windowed.reach
@@ -175,9 +180,8 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
             yield _with_corners(maps, task, system, actual) if narrow else maps
         if not few or task.finer > 1 or not (varies or uneven):
             return
-    yield windows_map(task, system.weights, system.bands, actual, HALO)
-    if few and not narrow:
-        yield windows_map(task, system.weights, system.bands, actual, LONG_HALO)
+    for halo in halos if few and not narrow else halos[:1]:
+        yield windows_map(task, system.weights, system.bands, actual, halo)
 
 
 def _with_corners(maps: VarianceMap, task: EstimationTask, system: FrameSystem, actual: FloatArray) -> VarianceMap:

@@ -160,7 +160,7 @@ class FrameMethod(Method):
     def _frame_error(self, noise: dict[str, FloatArray], actual: FloatArray) -> FrameError:
         """Return the expected error, which depends on the noise and not on what is recorded."""
         task, system = self.task, self.system
-        maps = error_map(task, system, actual)
+        maps = error_map(task, system, actual, quick=self.execution.quick)
         variances = maps.variances
         self.execution.progress(0.7)
         resolved = 1 - variances.posterior.ravel() / maps.prior

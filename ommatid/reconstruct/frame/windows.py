@@ -32,7 +32,7 @@ from .variance_map import (
 )
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
-HALO, LONG_HALO = 8, 16  # pixels of f around it
+HALOS = 8, 12, 16  # pixels of f around it, of which a longer one takes several times as long
 MOST_ENTRIES = 30_000_000  # of H of a part, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
 SIDE, WINDOWS = 28, 3  # pixels of f of a window that shows what the variation of kernels does; windows along each axis
@@ -171,7 +171,7 @@ def by_windows(
     for row, column in np.ndindex(ratios.shape[1:]):
         corner = int(starts[0][row]), int(starts[1][column])
         core = tuple(
-            slice(0 if first == 0 else HALO, side if first + side == size else side - HALO)
+            slice(0 if first == 0 else HALOS[0], side if first + side == size else side - HALOS[0])
             for first, size in zip(corner, shape, strict=True)
         )
         found, other = (

@@ -127,11 +127,15 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Execution:
-    """Workers for parallel tasks (default: threads of this process), a callback for progress, and what frames share."""
+    """Workers for parallel tasks (default: threads of this process), a callback for progress, and what frames share.
+
+    quick : True leaves out slow maps of a frame's error, where its mean alone is compared with that of another model
+    """
 
     workers: Workers | None = None
     progress: Progress = no_progress
     prepared: Prepared | None = None
+    quick: bool = False
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,10 @@ def _whole_robust(task: EstimationTask) -> WindowProblem:
     """Whiten each sub-imager by its own covariance; its errors then count in units of that covariance."""
     camera, method = task.model.camera, RobustMethod(task, Execution())
     sub_imager = _sub_imager_of(camera, np.flatnonzero(task.used))
-    return WindowProblem(method.problem, method.recorded, sub_imager, len(camera.sub_imagers))
+    problem = method.problem
+    matrix, prior = _with_unknowns(problem.matrix, problem.prior, [_level(problem.matrix, task)])
+    problem = Problem(matrix, prior, problem.noise_variance)
+    return WindowProblem(problem, method.recorded, sub_imager, len(camera.sub_imagers))
 
 
 def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProblem]:
@@ -164,11 +167,16 @@ def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProb
     for rows, columns in chosen:
         window = task.window(rows, columns)
         noise = window.expected_noise if directions is None else without_shared(task)[window.index]
-        level = window.matrix.sum(axis=1)[:, None] * task.prior.level_deviation
-        unknowns = [sparse.csc_array(level), *([] if directions is None else [directions[window.index]])]
+        level = _level(window.matrix, task)
+        unknowns = [level, *([] if directions is None else [directions[window.index]])]
         matrix, prior = _with_unknowns(window.matrix, prior_on(window.shape), unknowns)
         sub_imager = _sub_imager_of(camera, used[window.index])
         yield WindowProblem(Problem(matrix, prior, noise), window.recorded, sub_imager, len(camera.sub_imagers))
+
+
+def _level(matrix: sparse.csr_array, task: EstimationTask) -> sparse.csc_array:
+    """Return what a standard deviation of the level of the image, 0 if it is known, does to the readings: (m, 1)."""
+    return sparse.csc_array(matrix.sum(axis=1)[:, None] * task.prior.level_deviation)
 
 
 def _with_unknowns(

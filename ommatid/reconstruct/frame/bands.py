@@ -97,6 +97,7 @@ class Bands:
     """The camera's lens types as rows b_t, and the prior, on the waves of a world.
 
     shape : rows and columns of f;  detail : F;  spectrum : P, (F rows, F columns);  weights : w_t
+    simpler : the same by one kernel of each lens type, where some have several
     """
 
     shape: tuple[int, int]
@@ -104,6 +105,7 @@ class Bands:
     spectrum: FloatArray
     types: tuple[Readings, ...]
     weights: tuple[float, ...]
+    simpler: Bands | None = field(default=None, repr=False)
     scale: FloatArray | float = field(default=1.0, repr=False)  # S of the precision S K S, (F rows, F columns)
 
     @cached_property
@@ -309,18 +311,25 @@ def bands_of(camera: Camera, detail: int, spectrum: FloatArray, weights: FloatAr
     camera : on the grid of the world;  weights : (M,) 1 / Rv;  observation : H, whose kernels are taken as they are
     """
     parts = {part.places.lens_type.name: part for part in observation.parts if isinstance(part, KernelFootprints)}
+    means: list[Readings] = []
     types: list[Readings] = []
-    means: list[float] = []
+    noise: list[float] = []
     for lens_type, rows in zip(camera.types, camera.type_slices(), strict=True):
-        kernel = None if lens_type.name not in parts else parts[lens_type.name].mean_kernel
-        readings = _boxes(lens_type, detail) if kernel is None else _kernels(lens_type, kernel, detail)
-        taken = lens_type.measurements / (readings.count[0] * readings.count[1])
-        types.append(readings)
-        means.append(float(weights[rows].mean()) * taken)
-    return Bands((camera.rows // detail, camera.columns // detail), detail, spectrum, tuple(types), tuple(means))
+        part = parts.get(lens_type.name)
+        kernel = _box(float(lens_type.ratio)) if part is None else part.mean_kernel
+        means.append(_by_kernel(lens_type, kernel, detail))
+        # In front of a finer world every kernel would be one row more in every group.
+        types.append(means[-1] if part is not None or detail > 1 else _boxes(lens_type))
+        taken = lens_type.measurements / (means[-1].count[0] * means[-1].count[1])
+        noise.append(float(weights[rows].mean()) * taken)
+    shape = camera.rows // detail, camera.columns // detail
+    bands = Bands(shape, detail, spectrum, tuple(means), tuple(noise))
+    if all(len(each.kernels) == 1 for each in types):
+        return bands
+    return replace(bands, types=tuple(types), simpler=bands)
 
 
-def _kernels(lens_type: LensType, kernel: FloatArray, detail: int) -> Readings:
+def _by_kernel(lens_type: LensType, kernel: FloatArray, detail: int) -> Readings:
     """Return the readings by a kernel, and its mirror images, one pixel of f apart in the field of a lens type."""
     first, count = list[int](), list[int]()
     for (start, end), length in zip(lens_type.bounds, kernel.shape, strict=True):
@@ -330,20 +339,26 @@ def _kernels(lens_type: LensType, kernel: FloatArray, detail: int) -> Readings:
     return Readings((upright + upright[:, ::-1])[None] / 4, (first[0], first[1]), (count[0], count[1]))
 
 
-def _boxes(lens_type: LensType, detail: int) -> Readings:
+def _box(ratio: float) -> FloatArray:
+    """Return the mean over a box of this side: (rows, columns)."""
+    side = ceil(ratio)
+    share = np.full(side, 1 / ratio)
+    share[[0, -1]] = (1 - (side - 2) / ratio) / 2 if side > 1 else 1.0
+    return np.outer(share, share)
+
+
+def _boxes(lens_type: LensType) -> Readings:
     """Return the readings by boxes one pixel of f apart, by kernels of their mean power where places are fractions."""
     ratio, axes = lens_type.ratio, list[FloatArray]()
     first, count = list[int](), list[int]()
     for axis, (start, end) in enumerate(lens_type.bounds):
         first.append(floor(start))
-        count.append(max(floor((end - ratio - first[axis]) / detail) + 1, 1))
+        count.append(max(floor(end - ratio - first[axis]) + 1, 1))
         views = product(lens_type.starts(axis), range(lens_type.pixels[axis]))
-        axes.append(_mean_power(float(ratio), [float((view + ratio * n - first[axis]) % detail) for view, n in views]))
+        axes.append(_mean_power(float(ratio), [float((view + ratio * n - first[axis]) % 1) for view, n in views]))
     kernels = np.einsum("ax,by->abxy", *axes).reshape(-1, axes[0].shape[1], axes[1].shape[1])
     power = np.square(kernels).sum(axis=(1, 2))
-    # In front of a finer world every kernel would be one row more in every group: the strongest one serves.
-    strong = power >= (LEAST_PART if detail == 1 else 1.0) * power.max()
-    return Readings(kernels[strong], (first[0], first[1]), (count[0], count[1]))
+    return Readings(kernels[power > LEAST_PART * power.max()], (first[0], first[1]), (count[0], count[1]))
 
 
 def _mean_power(ratio: float, starts: list[float]) -> FloatArray:

@@ -109,14 +109,15 @@ class FrameSystem:
 
     @cached_property
     def preconditioner(self) -> Bands | None:
-        """P of the mean weights, or scaled by the local ones where noise is uneven: what takes the fewest steps."""
+        """P of all kernels or their means, by the mean weights or scaled by local ones: what takes the fewest steps."""
         if self.similar is not None or self.bands is None:
             return self.similar
         pairs = zip(self._types, self.mean_weights, strict=True)
+        found = self._fastest(self.bands, *([] if self.bands.simpler is None else [self.bands.simpler]))
         if all(float(np.ptp(self.weights[part])) <= EVEN * weight for part, weight in pairs):
-            return self.bands
+            return found
         scale = np.sqrt(self.levels(lambda image: image)).reshape(self.shape)
-        return min((self.bands, replace(self.bands, scale=scale)), key=self._after_trial)
+        return self._fastest(found, replace(found, scale=scale))
 
     def levels(self, of: Callable[[FloatArray], FloatArray]) -> FloatArray:
         """Return the weights of the measurements of each pixel relative to the means of their lens types.
@@ -132,6 +133,9 @@ class FrameSystem:
         """H^T w of the weights, and of their means over each lens type: (N,) each."""
         means = np.repeat(self.mean_weights, [part.stop - part.start for part in self._types])
         return self.observation.adjoint(self.weights), self.observation.adjoint(means)
+
+    def _fastest(self, *candidates: Bands) -> Bands:
+        return candidates[0] if len(candidates) == 1 else min(candidates, key=self._after_trial)
 
     def _after_trial(self, candidate: Bands) -> float:
         """Return the bound that a few steps with a preconditioner reach."""

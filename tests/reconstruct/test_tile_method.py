@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ommatid.reconstruct.frame import conjugate_gradients
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.methods.tile_method import TileMethod
 from ommatid.reconstruct.methods.tile_solver import overlapping_tiles
+from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.pool import worker_pool
@@ -32,6 +34,20 @@ def task_of(scene: Scene, truth: FloatArray, seed: int = 0) -> EstimationTask:
     used = np.ones(stack.values.size, dtype=np.bool_)
     model = ideal_model(scene, stack.camera)
     return EstimationTask(model, stack.values, used, expected, scene.prior, scene.estimator, scene.tiles)
+
+
+def test_tiles_of_a_frame_that_conjugate_gradients_do_not_solve_state_no_expectation_for_their_estimate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = wide((70, 66), noise={"variance": NOISE}, estimator={"method": "tiles"})
+    stack = recorded(scene, drawn((70, 66)), NOISE)
+    found = restore(stack, ideal_model(scene, stack.camera))
+    assert found.solver.method.startswith("tiles")
+    given = found.given_estimate()
+    assert given is not None
+    assert 0 < given < found.expected.mse
+    monkeypatch.setattr(conjugate_gradients, "MAX_STEPS", 1)
+    assert found.given_estimate() is None
 
 
 @given(st.integers(1, 150), st.integers(1, 150), st.integers(4, 40), st.integers(0, 19))

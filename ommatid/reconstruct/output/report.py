@@ -98,9 +98,7 @@ def _error(restoration: Reconstruction, stack: Stack) -> ErrorReport:
         measured["gain"] = None if psnr is None or single.psnr is None else psnr - single.psnr
     if restoration.interval is not None:
         measured["expected_given_truth"] = IntervalReport.model_validate(restoration.interval)
-    # It takes as long as an estimate, and frames of a film share the error bars of the first one.
-    alone = restoration.error is None and restoration.result.noise_difference is None
-    given = restoration.given_estimate() if alone else None
+    given = restoration.given_estimate() if restoration.error is None else None
     if given is not None:
         measured["expected_given_estimate"] = given
     return ErrorReport(

@@ -22,24 +22,24 @@ Array = NDArray[np.float64]
 SHAPE, DETAIL = (7, 8), 3
 
 
-def reflected(size: int, length: int, odd: bool) -> tuple[list[NDArray[np.intp]], Array]:
+def reflected(size: int, length: int, odd: bool, detail: int = DETAIL) -> tuple[list[NDArray[np.intp]], Array]:
     """The world's pixels that each reading sees along an axis, reflected at the edges, and the root of its weight."""
     middles = np.arange(size) + 0.5 if odd else np.arange(size + 1.0)
     roots = np.ones(middles.size)
     if not odd:
         roots[[0, -1]] = 0.5**0.5  # a reading on an edge is its own mirror image
-    end = size * DETAIL
-    seen = [(np.rint(middle * DETAIL - length / 2).astype(int) + np.arange(length)) % (2 * end) for middle in middles]
+    end = size * detail
+    seen = [(np.rint(middle * detail - length / 2).astype(int) + np.arange(length)) % (2 * end) for middle in middles]
     return [np.where(each < end, each, 2 * end - 1 - each) for each in seen], roots
 
 
-def continued(kernel: Array, odd: bool) -> Array:
+def continued(kernel: Array, odd: bool, detail: int = DETAIL) -> Array:
     """Readings beyond the edges included, as a matrix."""
-    axes = [reflected(size, length, odd) for size, length in zip(SHAPE, kernel.shape, strict=True)]
+    axes = [reflected(size, length, odd, detail) for size, length in zip(SHAPE, kernel.shape, strict=True)]
     rows: list[Array] = []
     for down, root in zip(*axes[0], strict=True):
         for across, factor in zip(*axes[1], strict=True):
-            row = np.zeros((SHAPE[0] * DETAIL, SHAPE[1] * DETAIL))
+            row = np.zeros((SHAPE[0] * detail, SHAPE[1] * detail))
             np.add.at(row, (down[:, None], across[None, :]), root * factor * kernel)
             rows.append(row.ravel())
     return np.array(rows)
@@ -73,6 +73,27 @@ def test_groups_of_waves_invert_the_precision_of_reflected_readings(
     monkeypatch.setattr(Bands, "_corners", [])
     image = np.random.default_rng(1).normal(size=bands.spectrum.shape)
     np.testing.assert_allclose(bands.solve(image).ravel(), covariance @ image.ravel(), atol=1e-12)
+
+
+@pytest.mark.parametrize("side", [3, 4])
+def test_even_and_odd_kernels_invert_the_precision_of_their_reflected_readings(
+    side: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the grid of f, with middles on its pixels and between them."""
+    monkeypatch.setattr(Bands, "_strips", ())
+    monkeypatch.setattr(Bands, "_corners", [])
+    rng = np.random.default_rng(side)
+    spectrum, kernel = rng.random(SHAPE) + 0.1, rng.random((side, side))
+    upright, turned = kernel + kernel[::-1], kernel - kernel[::-1]
+    kernels = np.array([part + sign * part[:, ::-1] for part in (upright, turned) for sign in (1, -1)])
+    bands = Bands(SHAPE, 1, spectrum, (Readings(kernels, (0, 0), SHAPE),), (0.7,))
+    waves = np.kron(*(fft.dct(np.eye(size), 2, axis=0, norm="ortho") for size in SHAPE))
+    precision = waves.T @ np.diag(1 / spectrum.ravel()) @ waves
+    for part in kernels:
+        matrix = continued(part, side % 2 == 1, detail=1)
+        precision += 0.7 * matrix.T @ matrix
+    image = rng.normal(size=SHAPE)
+    np.testing.assert_allclose(bands.solve(image).ravel(), np.linalg.solve(precision, image.ravel()), atol=1e-12)
 
 
 def test_variances_far_from_the_edges_are_those_of_the_averages(camera: tuple[Bands, Array, list[Array]]) -> None:

@@ -285,14 +285,17 @@ def test_estimators_of_misalignment_take_a_world_of_pixels(misalignment: str) ->
         restore(stack, model)
 
 
-def test_held_out_errors_are_those_of_the_world() -> None:
+@pytest.mark.parametrize("level", [0.0, 64.0])
+def test_held_out_errors_are_those_of_the_world(level: float) -> None:
     """Predictions of a sub-imager from the others, with the covariance of the world itself, by the normal equations."""
     shown = case("distorted")
-    world = drawn(shown, 7)
-    checked = check_held_out(shown.recorded(world, 7), shown.model)
+    world = drawn(shown, 7) - level
+    stack = shown.recorded(world, 7)
+    prior = stack.scene.prior.model_copy(update={"level": level or "known"})
+    checked = check_held_out(replace(stack, scene=stack.scene.model_copy(update={"prior": prior})), shown.model)
     matrix = shown.model.matrix.toarray()
-    covariance = matrix @ shown.covariance @ matrix.T + NOISE * np.eye(len(matrix))
-    residual = shown.recorded(world, 7).values - matrix @ np.full(len(world), 127.5)
+    covariance = matrix @ (shown.covariance + level**2) @ matrix.T + NOISE * np.eye(len(matrix))
+    residual = stack.values - matrix @ np.full(len(world), 127.5)
     for sub, rows in zip(checked.sub_imagers, shown.setup.camera.slices(), strict=True):
         block, others = np.arange(len(matrix))[rows], np.delete(np.arange(len(matrix)), rows)
         gain = np.linalg.solve(covariance[np.ix_(others, others)], covariance[np.ix_(others, block)]).T

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +15,6 @@ from ommatid.reconstruct.methods.tile_solver import (
     Posterior,
     disjoint_tiles,
     merge_posteriors,
-    merge_tiles,
     tile_posterior,
 )
 from ommatid.reconstruct.prior import Prior, exponential, independent
@@ -61,6 +62,12 @@ def assert_same(first: Posterior, second: Posterior, tolerance: float) -> None:
     np.testing.assert_allclose(first.mean, second.mean, rtol=0, atol=tolerance * size)
     difference = np.abs(first.covariance - second.covariance)
     assert (difference <= tolerance * np.outer(deviation, deviation)).all()
+
+
+def merge_tiles(problem: Problem, recorded: FloatArray, tiles: list[Indices]) -> Posterior:
+    """The posterior of all tiles together: each is estimated alone and merged with those before it."""
+    posteriors = (tile_posterior(problem, recorded, tile) for tile in tiles)
+    return reduce(lambda merged, tile: merge_posteriors(merged, tile, problem, recorded), posteriors)
 
 
 @pytest.mark.parametrize("noise", [1e-2, 1e-6])
@@ -136,8 +143,6 @@ def test_invalid_tiles_and_measurements_are_refused() -> None:
     for wrong in ([], [0, 0], [2], [-1]):
         with pytest.raises(InputError, match="each once"):
             tile_posterior(noisy, recorded, np.array(wrong, dtype=np.intp))
-    with pytest.raises(InputError, match="one tile or more"):
-        merge_tiles(noisy, recorded, [])
     extreme = Problem(matrix, independent(0.0, 1e308, 2), np.full(2, 1e-320))
     with pytest.raises(InputError, match="double precision"):
         tile_posterior(extreme, recorded, np.array([0, 1]))

@@ -4,7 +4,7 @@ The world w has F x F pixels in each pixel of f (F is 1 where it is no finer), a
 P is diagonal in the cosine waves of the world. Readings one pixel of f apart that continue beyond the edges, where they
 see the world reflected, map the waves of frequencies k, 2n - k, 2n + k, 4n - k, ... along an axis (n pixels of f) to
 one and the same wave of readings. In such a group of at most F x F waves a lens type is one row b_t, its transfer
-function with the signs of the aliases, and with the weights w_t = 1 / Rv
+function with the signs of the aliases (or several, of `Readings`), and with the weights w_t = 1 / Rv
 
     K = P^-1 + sum over types of w_t b_t b_t^T,   K^-1 = P - P B (W^-1 + B^T P B)^-1 B^T P,
 
@@ -130,8 +130,11 @@ class Bands:
             yield down @ kernel @ across.T
 
     def _along(self, readings: Readings, axis: int, turned: bool) -> FloatArray:
-        """Return the transfer function along an axis of each line of a kernel: (waves, lines)."""
-        norms = _norms(self.shape[axis], self.detail, readings.is_odd(axis, self.detail), turned)
+        """Return the transfer function along an axis of each line of a kernel: (waves, lines).
+
+        turned : of kernels that are odd along it, which have no aliases, as they stand for boxes on the grid of f alone
+        """
+        norms = _norms(self.shape[axis], self.detail, readings.is_odd(axis, self.detail))
         return norms[:, None] * _waves(self.shape[axis], self.detail, readings.extent[axis], turned)
 
     @cached_property
@@ -502,16 +505,12 @@ def _waves(size: int, detail: int, length: int, turned: bool) -> FloatArray:
     return np.sin(phases) if turned else np.cos(phases)
 
 
-def _norms(size: int, detail: int, odd: bool, turned: bool) -> FloatArray:
-    """Return the sign of each wave as readings see it, times the root of its norm on them: (F size,).
-
-    turned : they see its sine, which vanishes where the cosine does not
-    """
+def _norms(size: int, detail: int, odd: bool) -> FloatArray:
+    """Return the sign of each wave as readings see it, times the root of its norm on them: (F size,)."""
     number, place = np.divmod(np.arange(size * detail), size)
     turns = (number + 1) // 2  # by which the wave of the readings is shifted
     norms = np.full(size * detail, detail**-0.5)
     zero, highest = (place == 0) & (number % 2 == 0), (place == 0) & (number % 2 == 1)
-    norms[zero & (number > 0)] = 0.0 if turned else (2 / detail) ** 0.5
-    norms[highest] = 0.0 if odd != turned else (2 / detail) ** 0.5
-    norms = np.where(odd & (turns % 2 == 1), -norms, norms)
-    return np.where(turned & (number % 2 == 1), -norms, norms)
+    norms[zero & (number > 0)] = (2 / detail) ** 0.5
+    norms[highest] = 0.0 if odd else (2 / detail) ** 0.5
+    return np.where(odd & (turns % 2 == 1), -norms, norms)

@@ -134,8 +134,8 @@ def _whole_detailed(task: EstimationTask) -> WindowProblem:
         raise TypeError("expected a model with the covariance of its detail")
     prior, matrix = task.prior_on(task.shape), model.matrix[used]
     root: FloatArray = matrix @ (np.diag(prior.root) if prior.independent else prior.root)
-    level = matrix.sum(axis=1) * task.prior.level_deviation
-    covariance = root @ root.T + np.outer(level, level) + model.detail_covariance[np.ix_(used, used)]
+    level = _level(matrix, task).toarray()
+    covariance = root @ root.T + level @ level.T + model.detail_covariance[np.ix_(used, used)]
     noise, directions = task.expected_noise, task.shared_directions
     if directions is not None:
         covariance += (directions @ directions.T).toarray()
@@ -186,6 +186,8 @@ def _with_unknowns(
     directions = sparse.csc_array(sparse.hstack(parts, format="csc"))
     directions = directions[:, np.flatnonzero(np.diff(directions.indptr))]
     count = directions.shape[1]
+    if not count:
+        return matrix, prior
     if prior.independent:
         root: FloatArray = np.concatenate([prior.root, np.ones(count)])
     else:

@@ -119,7 +119,7 @@ def error_window(stack: Stack, model: Model, estimate: FloatArray, report: RunRe
 def why_none(scene: Scene) -> str:
     """Return what is left out without the kernels of an estimator, as a sentence, "" where they are known.
 
-    Robust and fitted estimators have another H, and noise or errors that are correlated within a sub-imager.
+    An estimator that fits H to the stack has another H, and errors that are correlated within a sub-imager.
     """
     misalignment = scene.estimator.misalignment
     if misalignment == "trust":

@@ -8,7 +8,7 @@ from typing import Any
 
 from ommatid.reconstruct.detail.detailed_model import model_of_f
 from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.misalignment.robust_noise import misalignment_variance
+from ommatid.reconstruct.misalignment.moments import misalignment_variance
 from ommatid.reconstruct.prediction import Prediction, predict, predict_frame
 from ommatid.reconstruct.prior import prior_of
 from ommatid.runtime.errors import InputError
@@ -60,7 +60,7 @@ def predict_ideal(scene: Scene) -> Prediction:
     choice = choose_method(scene, camera, exact=camera.is_applied)
     actual = expected_noise(setup)
     if choice.method == "fit":
-        raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' or 'robust' to predict")
+        raise InputError("estimator.misalignment 'fit' takes a recorded stack; take 'trust' to predict")
     if choice.method != "dense" or camera.has_detail:
         model = model_of_f(ideal_model(scene, camera.with_grid_of_matrix), camera, scene.prior)
         return replace(predict_frame(choice, model, camera, actual), assumes=assumes)

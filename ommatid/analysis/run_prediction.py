@@ -16,12 +16,12 @@ from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
 from ommatid.reconstruct.method_choice import METHODS, MethodChoice
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import Execution, MethodResult
-from ommatid.reconstruct.misalignment.robust_noise import (
+from ommatid.reconstruct.misalignment.moments import (
     CAUSE,
-    MisalignmentNoise,
+    MisalignedMoments,
+    misaligned_moments,
     mismatch_of_image,
     mismatch_variance,
-    robust_noise,
 )
 from ommatid.reconstruct.prediction import Prediction, observability
 from ommatid.reconstruct.prior import Prior
@@ -111,7 +111,7 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
     if mismatch is not None:
         budget[mismatch.cause] = float(mismatch.variance.mean())
     seen = None
-    if camera.unknowns <= MOST_DENSE and outcome.choice.method != "robust":
+    if camera.unknowns <= MOST_DENSE:
         of_pixels = model_of_f(recording.certain, camera, PriorTable())
         seen = observability(of_pixels.matrix[outcome.assumed.usable.used])
     return Prediction.of(
@@ -152,9 +152,9 @@ def _mismatch(setup: Setup, recording: PredictedRecording, outcome: _Outcome) ->
     of_picture = None
     if recording.truth is not None:
         image = Prior(recording.truth, np.zeros(camera.unknowns))
-        moments = robust_noise(camera, image) if averaged else MisalignmentNoise(recording.true, ())
+        moments = misaligned_moments(camera, image) if averaged else MisalignedMoments(recording.true, ())
         of_picture = float(mismatch_of_image(form, used, moments, slices, recording.truth).mean())
-    moments = robust_noise(camera, prior) if averaged else MisalignmentNoise(recording.true, ())
+    moments = misaligned_moments(camera, prior) if averaged else MisalignedMoments(recording.true, ())
     variance = mismatch_variance(form, used, moments, slices, prior)
     said = "H as designed; the error is the mean over assemblies within camera.tolerance"
     if not averaged:

@@ -27,10 +27,9 @@ from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 from ommatid.simulate.ideal import ideal_model, true_model
 
 NUMBERS, TABLE = "study.json", "study.csv"
-MISALIGNMENT = {"robust": "robust", "fitted": "fit"}  # estimator.misalignment by model; "trust" for all others
+MISALIGNMENT = {"fitted": "fit"}  # estimator.misalignment by model; "trust" for all others
 LABELS = {
     "ideal": "the ideal H",
-    "robust": "the ideal H, misalignment as noise",
     "points": "H of rendered point sources",
     "transport": "H by ray transport",
     "fitted": "H fitted to the stack itself",

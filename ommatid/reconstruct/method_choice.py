@@ -20,7 +20,7 @@ from .frame.windows import CORE, HALOS
 from .methods.dense_method import DenseMethod
 from .methods.method import Method
 from .methods.tile_method import TileMethod
-from .misalignment.misaligned_methods import AlignedMethod, RobustMethod
+from .misalignment.alignment import AlignedMethod
 
 PROGRAM_MEMORY = 300_000_000  # bytes, of the program itself and its libraries
 WORLD_IMAGES = 200  # of a world finer than f, that its solver holds at once; measured at 239 x 239 pixels of f
@@ -31,7 +31,6 @@ TILE_ACCURACY = 0.3  # posterior standard deviations from the exact answer, on a
 METHODS: dict[str, type[Method]] = {
     "dense": DenseMethod,
     "detail": DetailMethod,
-    "robust": RobustMethod,
     "fit": AlignedMethod,
     "tiles": TileMethod,
     "frame": FrameMethod,
@@ -124,7 +123,7 @@ def _candidates(scene: Scene, camera: Camera, exact: bool) -> tuple[list[str], s
 
 
 def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> MethodChoice:
-    """Choose the method of an estimator that expects a misaligned camera and starts from H as designed."""
+    """Choose the fit of H to the stack, which starts from H as designed."""
     method, other = scene.estimator.misalignment, scene.estimator.method
     key = f"{scene.source}: estimator.misalignment '{method}'"
     if camera.tolerance is None:
@@ -139,9 +138,7 @@ def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> Meth
         raise InputError(f"{key} takes one dense problem, got estimator.method '{other}'; set that to 'auto'")
     if not exact:
         raise InputError(f"{key} starts from H as designed, got a calibrated one; set calibration.method to 'ideal'")
-    largest = max(lens_type.pixels[0] * lens_type.pixels[1] for lens_type in camera.types)
-    blocks = 3 * 8 * camera.measurements * (largest + camera.unknowns)  # of Rv, and H whitened by them
-    memory = _memory("dense", scene, camera, exact=False) + blocks
+    memory = _memory("dense", scene, camera, exact=False) + 3 * 8 * camera.measurements * camera.unknowns
     if memory > allowed:
         raise InputError(
             f"{key} needs {memory / 1e9:.1f} GB, {allowed / 1e9:.1f} GB are allowed; raise estimator.memory"

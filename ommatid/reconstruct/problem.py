@@ -14,7 +14,6 @@ and -l is A^T z. The forms differ in the matrix they factorise, in cost, and in 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -124,54 +123,33 @@ class Problem:
 
 @dataclass(frozen=True)
 class Whitening:
-    """Cholesky factors K of the blocks of a block-diagonal Rv; K^-1 g has unit noise."""
+    """The Cholesky factor K of an Rv with covariances, (M, M); K^-1 g has unit noise."""
 
-    slices: tuple[slice, ...]
-    factors: tuple[FloatArray, ...]
+    factor: FloatArray
 
     @classmethod
-    def of(cls, blocks: Sequence[tuple[slice, FloatArray]], noise_variance: FloatArray, refusal: str) -> Whitening:
-        """Factorise blocks of covariance, each of some rows, with the independent noise of these, (M,).
+    def of(cls, covariance: FloatArray, noise_variance: FloatArray, refusal: str) -> Whitening:
+        """Factorise a covariance, (M, M), with the independent noise of the measurements, (M,).
 
-        Raises InputError with the words of `refusal` where noise is missing, so that a block is singular.
+        Raises InputError with the words of `refusal` where noise is missing, so that the sum is singular.
         """
         try:
-            factors = [
-                np.asarray(linalg.cholesky(block + np.diag(noise_variance[rows]), lower=True)) for rows, block in blocks
-            ]
+            return cls(np.asarray(linalg.cholesky(covariance + np.diag(noise_variance), lower=True)))
         except linalg.LinAlgError:
             raise InputError(refusal) from None
-        return cls(tuple(rows for rows, _ in blocks), tuple(factors))
 
     def vector(self, recorded: FloatArray) -> FloatArray:
         """Return K^-1 g: (M,) or (M, q)."""
-        white = np.empty_like(recorded)
-        for rows, factor in zip(self.slices, self.factors, strict=True):
-            white[rows] = linalg.solve_triangular(factor, recorded[rows], lower=True, check_finite=False)
-        return white
-
-    def matrix(self, matrix: sparse.csr_array) -> sparse.csr_array:
-        """Return K^-1 H: (M, N); every row has entries at all pixels that its sub-imager sees."""
-        parts: list[sparse.csr_array] = []
-        for rows, factor in zip(self.slices, self.factors, strict=True):
-            part = sparse.csc_array(matrix[rows])
-            seen = np.flatnonzero(np.diff(part.indptr))
-            white = linalg.solve_triangular(factor, part[:, seen].toarray(), lower=True, check_finite=False)
-            starts = seen.size * np.arange(white.shape[0] + 1)
-            indices = np.tile(seen, white.shape[0])
-            parts.append(sparse.csr_array((np.asarray(white).ravel(), indices, starts), shape=part.shape))
-        return sparse.csr_array(sparse.vstack(parts, format="csr"))
+        return np.asarray(linalg.solve_triangular(self.factor, recorded, lower=True, check_finite=False))
 
     def multipliers(self, white: FloatArray) -> FloatArray:
         """Return K^-T l, (M,) or (M, q): multipliers of the problem from those of the whitened one."""
-        multipliers = np.empty_like(white)
-        for rows, factor in zip(self.slices, self.factors, strict=True):
-            multipliers[rows] = linalg.solve_triangular(factor, white[rows], trans="T", lower=True, check_finite=False)
-        return multipliers
+        solved = linalg.solve_triangular(self.factor, white, trans="T", lower=True, check_finite=False)
+        return np.asarray(solved)
 
     def problem(self, matrix: sparse.csr_array, prior: Prior) -> Problem:
         """Return the whitened problem, K^-1 H with unit noise, for measurements K^-1 g."""
-        return Problem(self.matrix(matrix), prior, np.ones(matrix.shape[0]))
+        return Problem(sparse.csr_array(self.vector(matrix.toarray())), prior, np.ones(matrix.shape[0]))
 
 
 class NotSolvableError(Exception):

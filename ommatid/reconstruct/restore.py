@@ -28,7 +28,6 @@ from .expected_error import ExpectedError, Interval
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
 from .methods.method import EstimationTask, Execution, Method, MethodResult, Prepared, is_uniform, total_variance
-from .misalignment.robust_noise import CAUSE as MISALIGNMENT
 from .noise import Noise, UsablePixels, undithered, uniform
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
 from .prior_fit import PriorFit
@@ -120,7 +119,7 @@ def _whitened(stack: Stack, model: Model, assumed: Assumptions, result: MethodRe
         power=result.residual_power,
         used=assumed.usable.used,
         spread=_spread(stack, assumed, total),
-        shared=_shared(model, assumed, total, result),
+        shared=_shared(model, assumed, total),
         largest=max(1.0, _largest_ratio(total, expected_noise), assumed.method.task.prior_ratio),
     )
 
@@ -141,10 +140,8 @@ def _largest_ratio(total: FloatArray, expected: FloatArray) -> float:
     return float((total / expected).max())
 
 
-def _shared(model: Model, assumed: Assumptions, total: FloatArray, result: MethodResult) -> FloatArray:
-    """Return the share of the noise that a few errors per sub-imager cause: a fitted geometry, or misalignment."""
-    if MISALIGNMENT in result.expected.parts and result.interval is None:
-        return np.ones(total.size)
+def _shared(model: Model, assumed: Assumptions, total: FloatArray) -> FloatArray:
+    """Return the share of the noise that the few errors per sub-imager of a fitted geometry cause."""
     if not model.record.get("fit") or "calibration" not in assumed.noise:
         return uniform(0.0, total.size)
     return np.divide(assumed.noise["calibration"], total, out=np.zeros(total.size), where=total > 0)

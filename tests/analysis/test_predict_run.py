@@ -14,11 +14,11 @@ from ommatid.analysis.predicted_recording import predicted_recording
 from ommatid.analysis.prediction_table import json_of, rows
 from ommatid.reconstruct.expected_error import expected_error
 from ommatid.reconstruct.forms.cholesky import information
-from ommatid.reconstruct.misalignment.robust_noise import (
-    MisalignmentNoise,
+from ommatid.reconstruct.misalignment.moments import (
+    MisalignedMoments,
+    misaligned_moments,
     mismatch_of_image,
     mismatch_variance,
-    robust_noise,
 )
 from ommatid.reconstruct.prior import Prior, independent
 from ommatid.reconstruct.problem import Problem
@@ -131,7 +131,7 @@ def test_an_estimator_with_the_wrong_h() -> None:
     gain, prior = form.gain(np.eye(problem.measurements)), problem.prior
     used = np.ones(problem.measurements, dtype=np.bool_)
     noise = expected_error(form, {"noise": np.zeros(problem.measurements)}).variance
-    moments = MisalignmentNoise(true.tocsr(), ())
+    moments = MisalignedMoments(true.tocsr(), ())
     lost = np.eye(problem.unknowns) - gain @ true.toarray()
     exact = prior.variance[0] * np.square(lost).sum(axis=1)
     exact += np.square(gain @ ((true - problem.matrix) @ prior.mean))
@@ -158,7 +158,7 @@ def test_uncalibrated_tolerances_cost_a_picture_the_mean_over_assemblies() -> No
         np.square(start + form.gain((true_matrix(replace(camera, tolerance=each)) - matrix) @ image)).mean()
         for each in tolerances
     ]
-    moments = robust_noise(camera, Prior(image, np.zeros(144)))
+    moments = misaligned_moments(camera, Prior(image, np.zeros(144)))
     used = np.ones(camera.measurements, dtype=np.bool_)
     added = mismatch_of_image(form, used, moments, camera.slices(), image)
     predicted = float(np.square(start).mean() + added.mean())

@@ -179,8 +179,6 @@ def _lenses() -> Iterable[Cell]:
     yield Cell("still_life-29-ideal", "still_life", (_size(29), COARSE), 2)
     yield Cell("corridor-29-ideal", "corridor", (_size(29), COARSE), 2)
     yield Cell("misaligned-19-transport-8192", "misaligned", (*TILE, *_samples(8192)), 6)
-    robust = ("target.detail=1", IDEAL, "estimator.misalignment=robust")
-    yield Cell("misaligned-19-robust-ideal", "misaligned", (*TILE, *robust), 4)
     yield Cell("sensor-19-transport-4096", "sensor", (*TILE, *_samples(4096)), 8)
     yield Cell("single-29-transport-256", "single", (_size(29), *_samples(256)), 3)
     yield Cell("distorted-transport-4096", "distorted", (), 20)

@@ -62,7 +62,7 @@ def test_predictions_that_few_samples_make_too_small_are_not_trusted() -> None:
 def test_runs_differ_in_their_seeds_and_cells_do_too() -> None:
     seeds = [cell.described(number).render.seed for cell in CELLS for number in range(2)]
     assert len(set(seeds)) == len(seeds)
-    misaligned = BY_NAME["misaligned-19-robust-ideal"]
+    misaligned = BY_NAME["misaligned-19-transport-8192"]
     drawn = [misaligned.described(number).camera.tolerance for number in range(5)]
     assert len({tolerance.seed for tolerance in drawn if tolerance is not None}) == 5
 

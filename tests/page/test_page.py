@@ -362,17 +362,16 @@ def test_intervals_allow_for_correlated_errors(run: data.Run) -> None:
     assert independent / total < 0.9
 
 
-@pytest.mark.parametrize("misalignment", ["robust", pytest.param("fit", marks=pytest.mark.slow)])
-def test_what_a_trusting_estimator_alone_has_is_left_out_of_others(misalignment: str, run: data.Run) -> None:
+def test_what_a_trusting_estimator_alone_has_is_left_out_of_others(run: data.Run) -> None:
     """Kernels, correlations and other types are computed with H as it is and independent noise."""
-    plain: dict[str, Any] = run.stack.scene.plain() | {"estimator": {"misalignment": misalignment}}
+    plain: dict[str, Any] = run.stack.scene.plain() | {"estimator": {"misalignment": "fit"}}
     plain["camera"]["tolerance"] = {"position": "400 nm"}
     stack = replace(run.stack, scene=parse(plain, run.stack.scene.source))
     text = html_of(replace(run, stack=stack), verdict=VerdictReport(trusted=True, reasons=()))
     plots = ("Modulation transfer function", "Response to an edge", '"col">99 % interval', "nother lens type, of")
     reader = parsed(text)
     assert (reader.open, reader.mismatched) == ([], [])
-    assert text.count(f"not computed for <code>estimator.misalignment = &#39;{misalignment}&#39;</code>") == 1
+    assert text.count("not computed for <code>estimator.misalignment = &#39;fit&#39;</code>") == 1
     assert [words for words in plots if words in text] == []
     assert "Radial spectrum of the error" in text
     assert "groups without intervals" in text

@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from ommatid.reconstruct.estimator.estimate import estimate
-from ommatid.reconstruct.misalignment.misaligned_methods import Alignment, align
-from ommatid.reconstruct.misalignment.robust_noise import misaligned_matrix, tolerances
+from ommatid.reconstruct.misalignment.alignment import Alignment, align
+from ommatid.reconstruct.misalignment.moments import misaligned_matrix, tolerances
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray

@@ -11,7 +11,7 @@ import pytest
 from ommatid.analysis.predict import predict_ideal
 from ommatid.analysis.run_prediction import predict_run
 from ommatid.reconstruct.estimator.estimate import factorise
-from ommatid.reconstruct.misalignment.robust_noise import misalignment_variance
+from ommatid.reconstruct.misalignment.moments import misalignment_variance
 from ommatid.reconstruct.prior import independent, prior_of
 from ommatid.reconstruct.problem import Problem
 from ommatid.reconstruct.restore import Reconstruction, restore
@@ -148,7 +148,7 @@ def test_the_cost_of_misalignment_is_that_of_images_with_the_actual_variance() -
     ("tables", "conflict"),
     [
         ({"prior": {"kind": "fit"}}, "prior.kind 'fit'"),
-        ({"estimator": {"misalignment": "robust"}}, "misalignment 'trust', got 'robust'"),
+        ({"estimator": {"misalignment": "fit"}}, "misalignment 'trust', got 'fit'"),
     ],
 )
 def test_an_assumed_variance_beside_a_prior_that_is_not_known_is_refused(tables: dict[str, Any], conflict: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,11 +17,10 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.model import RECORDED, Model
-from ommatid.scenes.scene import parse
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_model
 
-from ..examples import PAIR, POSITION, THREE, Lenses, scene
+from ..examples import THREE, Lenses, scene
 from ..frames import recorded as stack_of
 from ..frames import wide
 
@@ -206,20 +204,6 @@ def test_a_frame_of_ten_thousand_readings_names_its_cause() -> None:
     done = restore(replace(stack, values=turned), ideal_model(described, camera))
     assert done.choice.method == "frame"
     assert_named("flip", "upside down in sub-imager (2, 1) of type B", done.verdict.reasons[0])
-
-
-def test_a_robust_estimator_names_what_is_beyond_its_tolerance() -> None:
-    data = scene((12, 12), PAIR, noise={"variance": 1e-2}, calibration={"method": "ideal"}).plain()
-    data["camera"]["tolerance"], data["estimator"] = POSITION, {"misalignment": "robust"}
-    described = parse(data, Path("test.toml"))
-    camera = derive(described)
-    stack = stack_of(described, np.random.default_rng(0).normal(127.5, 30, 144), 1e-2)
-    part = camera.slices()[1]
-    stack.values[part] += 20.0
-    model = ideal_model(described, camera)
-    for reasons in (restore(stack, model).verdict.reasons, check_held_out(stack, model, fitted=False).verdict.reasons):
-        assert "an offset of 2" in reasons[0], reasons
-        assert "in sub-imager (0, 1) of type A" in reasons[0], reasons
 
 
 def test_noise_is_named_where_the_picture_is_flat() -> None:

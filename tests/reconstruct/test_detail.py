@@ -274,10 +274,9 @@ def test_uncertain_entries_of_the_world_become_uncertain_measurements() -> None:
     assert float((stated / scatter).mean()) == pytest.approx(1, abs=0.05)
 
 
-@pytest.mark.parametrize("misalignment", ["robust", "fit"])
-def test_estimators_of_misalignment_take_a_world_of_pixels(misalignment: str) -> None:
+def test_a_fitted_misalignment_takes_a_world_of_pixels() -> None:
     shown = case("misaligned")
-    estimator = shown.scene.estimator.model_copy(update={"misalignment": misalignment})
+    estimator = shown.scene.estimator.model_copy(update={"misalignment": "fit"})
     setup = replace(shown.setup, scene=shown.scene.model_copy(update={"estimator": estimator}))
     model = ideal_model(setup.resolved, setup.calibrated.camera)
     stack = exposed(setup, model.forward(drawn(shown, 1)), np.zeros(model.measurements), {})

@@ -124,6 +124,8 @@ def test_lens_types_are_kept_in_the_order_named_and_doubled() -> None:
         ("render.samples=8", ["render.samples", "16", "8"]),
         ("prior.variance=inf", ["prior.variance", "finite"]),
         ("camera.lens.Z.array=[1, 1]", ["'Z'", "'A'"]),
+        ("estimator.misalignment=robust", ["estimator.misalignment", "withdrawn; take 'fit'"]),
+        ("estimator.method=svd", ["estimator.method", "take 'auto'"]),
     ],
 )
 def test_refusals_name_file_key_and_what_was_expected(change: str, words: list[str]) -> None:
@@ -161,7 +163,7 @@ def test_common_units_are_those_of_pint_to_the_last_bit(unit: tuple[str, str], n
         ("target.detail=2", "fit"),
         ("camera.lens.I.magnification=2/7", "fit"),
         ("camera.tolerance.position=1 um", "fit"),
-        ("estimator.misalignment=robust", "independent"),
+        ("estimator.misalignment=fit", "independent"),
     ],
 )
 def test_a_prior_without_a_kind_is_fitted(tmp_path: Path, change: str, kind: str) -> None:

@@ -267,8 +267,7 @@ class DetailMethod(DenseMethod):
     def observation(self) -> tuple[sparse.csr_array, CorrelatedNoise]:
         """H of the measurements used, and their noise with that of detail."""
         task, model = self.task, self._model
-        whole = slice(0, task.expected_noise.size)
-        white = Whitening.of([(whole, _of_used(model, task.used))], task.expected_noise, NEEDS_NOISE)
+        white = Whitening.of(_of_used(model, task.used), task.expected_noise, NEEDS_NOISE)
         # Errors that measurements share are whitened as independent ones, but the actual noise is without them.
         return model.matrix[task.used], CorrelatedNoise(white, CAUSE, task.shared_variance)
 

@@ -28,7 +28,6 @@ from ..assumptions import assumptions_for, with_fallback
 from ..detail.detailed_model import DetailedModel
 from ..method_choice import METHODS, MethodChoice
 from ..methods.method import EstimationTask, Execution, Method
-from ..misalignment.misaligned_methods import RobustMethod
 from ..output.run_json import HeldOutEntry, HeldOutPrior, HeldOutReport, HeldOutVerdict, HeldOutWindows
 from ..prior import FittedPrior
 from ..prior_fit import fit_prior
@@ -90,7 +89,7 @@ def check_task(
     if method == "fit":
         raise InputError(
             "estimator.misalignment 'fit' fits H to all sub-imagers at once, so that none is held out; set it to"
-            " 'trust' or 'robust'"
+            " 'trust'"
         )
     if not (task.expected_noise > 0).all():
         raise InputError(
@@ -99,12 +98,12 @@ def check_task(
         )
     to_fit = fitted and task.prior.kind == "independent" and len(task.model.camera.sub_imagers) > 1
     prior = _fitted(task) if to_fit else None
-    robust, execution = method == "robust", execution or Execution()
+    execution = execution or Execution()
     # Parts of a picture differ more from one another than the fitted prior knows; the scene's is wide enough for all.
     tasks = [task] if prior is None else [replace(task, prior=prior), task]
     found: list[HeldOutReport] = []
     for each in tasks:
-        found.append(_check(each, robust, execution, fitted=each is not task))
+        found.append(_check(each, execution, fitted=each is not task))
         if found[-1].verdict.trusted is not False:
             return found[-1]
     return _with_cause(found[0], stack, METHODS[method](tasks[0], execution))
@@ -112,11 +111,10 @@ def check_task(
 
 def _with_cause(report: HeldOutReport, stack: Stack, method: Method) -> HeldOutReport:
     """Return the report of sub-imagers that disagree with the likely cause."""
-    robust = isinstance(method, RobustMethod)
     worst = np.array([entry.disagrees or entry.named for entry in report.sub_imagers])
 
     def excess(recorded: FloatArray, _: FloatArray) -> float:
-        sums = held_out_sums(replace(method.task, recorded=recorded), robust, method.execution)
+        sums = held_out_sums(replace(method.task, recorded=recorded), method.execution)
         return float(np.maximum(_excess(sums)[worst], 0.0).sum())
 
     index = {entry.name: number for number, entry in enumerate(report.sub_imagers)}
@@ -137,11 +135,11 @@ def _fitted(task: EstimationTask) -> FittedPrior | None:
         return None
 
 
-def _check(task: EstimationTask, robust: bool, execution: Execution, *, fitted: bool) -> HeldOutReport:
-    shown, total = windows(task, robust)
-    first = held_out_sums(task, robust, execution)
+def _check(task: EstimationTask, execution: Execution, *, fitted: bool) -> HeldOutReport:
+    shown, total = windows(task)
+    first = held_out_sums(task, execution)
     disagreeing = _disagreeing(first)
-    named, sums = _culprits(task, robust, execution, first)
+    named, sums = _culprits(task, execution, first)
     for index, before in named.items():
         sums = sums.replaced(index, before)
     subs = tuple(
@@ -177,7 +175,7 @@ def quick_check(stack: Stack, task: EstimationTask, method: str) -> HeldOutRepor
     """Check a task with its own prior as a part of a run; None where it is not possible, or would take long."""
     possible = method != "fit" and task.used.any() and bool((task.expected_noise > 0).all())
     most = MOST_QUICK_DETAILED if isinstance(task.model, DetailedModel) else MOST_QUICK
-    if not possible or task.expected_noise.size > most or len(windows(task, method == "robust")[0]) > 1:
+    if not possible or task.expected_noise.size > most or len(windows(task)[0]) > 1:
         return None
     try:
         return check_task(stack, task, method, fitted=False)
@@ -186,7 +184,7 @@ def quick_check(stack: Stack, task: EstimationTask, method: str) -> HeldOutRepor
 
 
 def _culprits(
-    task: EstimationTask, robust: bool, execution: Execution, first: HeldOutSums
+    task: EstimationTask, execution: Execution, first: HeldOutSums
 ) -> tuple[dict[int, HeldOutSums], HeldOutSums]:
     """Return the sub-imagers after whose removal all others agree, none if there are no such, and the others' sums.
 
@@ -199,7 +197,7 @@ def _culprits(
             return {}, first
         excess = _excess(last)
         named[int(np.argmax(np.where(disagreeing, excess, -np.inf)))] = last
-        last = held_out_sums(_without(task, tuple(named)), robust, execution)
+        last = held_out_sums(_without(task, tuple(named)), execution)
         remaining = _excess(last)[_disagreeing(last)].sum()
         if remaining > (1 - LEAST_PROGRESS) * excess[disagreeing].sum():
             return {}, first

@@ -21,7 +21,6 @@ from ommatid.scenes.camera import Camera
 
 from ..detail.detailed_model import DetailedModel
 from ..methods.method import EstimationTask, Execution
-from ..misalignment.misaligned_methods import RobustMethod
 from ..prior import Prior, covariance_root
 from ..problem import Problem
 from .block_errors import block_errors
@@ -72,10 +71,10 @@ class WindowProblem:
     count: int
 
 
-def windows(task: EstimationTask, robust: bool) -> tuple[list[Window], int]:
+def windows(task: EstimationTask) -> tuple[list[Window], int]:
     """Return the windows of a task's target that are checked, and the number that would cover it."""
     shape = task.shape
-    if robust or _knows_detail(task) or shape[0] * shape[1] <= MOST_WHOLE:
+    if _knows_detail(task) or shape[0] * shape[1] <= MOST_WHOLE:
         return [(slice(0, shape[0]), slice(0, shape[1]))], 1
     side = min(max(WINDOW, REACHES * task.model.windowed.reach), WIDEST_WINDOW)
     rows, columns = (_intervals(size, side) for size in shape)
@@ -83,15 +82,13 @@ def windows(task: EstimationTask, robust: bool) -> tuple[list[Window], int]:
     return [(down, across) for down, across in shown], len(rows) * len(columns)
 
 
-def held_out_sums(task: EstimationTask, robust: bool, execution: Execution) -> HeldOutSums:
+def held_out_sums(task: EstimationTask, execution: Execution) -> HeldOutSums:
     """Predict the used pixels of every sub-imager from all others, and sum their squares.
 
-    Sums are 0 where there are no others to predict from.
-    robust : True if the noise holds the misalignment that the camera's tolerance allows
-    """
-    if robust or _knows_detail(task):
-        return _sums(_whole_robust(task) if robust else _whole_detailed(task))
-    chosen, _ = windows(task, robust)
+    Sums are 0 where there are no others to predict from."""
+    if _knows_detail(task):
+        return _sums(_whole_detailed(task))
+    chosen, _ = windows(task)
     if len(chosen) == 1:
         return _sums(next(_problems(task, chosen)))
     with one_thread(), worker_pool(threads=processors()) as pool:
@@ -143,16 +140,6 @@ def _whole_detailed(task: EstimationTask) -> WindowProblem:
     light = Prior(matrix @ prior.mean, covariance_root(covariance))
     problem = Problem(sparse.csr_array(sparse.eye_array(used.size)), light, noise)
     return WindowProblem(problem, task.recorded[used], _sub_imager_of(camera, used), len(camera.sub_imagers))
-
-
-def _whole_robust(task: EstimationTask) -> WindowProblem:
-    """Whiten each sub-imager by its own covariance; its errors then count in units of that covariance."""
-    camera, method = task.model.camera, RobustMethod(task, Execution())
-    sub_imager = _sub_imager_of(camera, np.flatnonzero(task.used))
-    problem = method.problem
-    matrix, prior = _with_unknowns(problem.matrix, problem.prior, [_level(problem.matrix, task)])
-    problem = Problem(matrix, prior, problem.noise_variance)
-    return WindowProblem(problem, method.recorded, sub_imager, len(camera.sub_imagers))
 
 
 def _problems(task: EstimationTask, chosen: list[Window]) -> Iterator[WindowProblem]:

@@ -1,1 +1,1 @@
-"""Reconstruction with misaligned sub-imagers: as noise, fitted to the stack, or ignored at a known cost."""
+"""Reconstruction with misaligned sub-imagers: fitted to the stack, or ignored at a known cost."""

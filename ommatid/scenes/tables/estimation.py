@@ -145,6 +145,15 @@ def _check_method(method: object) -> object:
     return method
 
 
+def _check_misalignment(misalignment: object) -> object:
+    if misalignment == "robust":
+        raise ValueError(
+            "'robust' is withdrawn; take 'fit', which finds the misalignment in the stack itself, or 'trust' with a"
+            " calibrated H"
+        )
+    return misalignment
+
+
 class EstimatorTable(Table):
     """Settings of the estimate of the image."""
 
@@ -166,9 +175,9 @@ class EstimatorTable(Table):
     accuracy: float = Field(
         default=0.01, gt=0, le=1, description="largest numerical error of a frame, in posterior standard deviations"
     )
-    misalignment: Literal["trust", "robust", "fit"] = Field(
+    misalignment: Annotated[Literal["trust", "fit"], BeforeValidator(_check_misalignment)] = Field(
         default="trust",
-        description='camera.tolerance is "trust": ignored, "robust": treated as noise, "fit": fitted to the stack',
+        description='misalignment within camera.tolerance is "trust": ignored, "fit": fitted to the stack',
     )
     memory: Memory | None = Field(default=None, description='limit, such as "4 GB"; absent: half of the free memory')
 
@@ -186,12 +195,12 @@ class StudyTable(Table):
     """One stack reconstructed several times, each time with another model H."""
 
     models: Annotated[
-        tuple[Literal["ideal", "robust", "points", "transport", "fitted", "true"], ...],
+        tuple[Literal["ideal", "points", "transport", "fitted", "true"], ...],
         BeforeValidator(pair),
         Field(min_length=1),
     ] = Field(
-        description="ideal: as designed; robust: that, and misalignment as more noise; points, transport: calibrated;"
-        " fitted: to the stack; true: with the misalignment that was drawn"
+        description="ideal: as designed; points, transport: calibrated; fitted: to the stack; true: with the"
+        " misalignment that was drawn"
     )
 
 

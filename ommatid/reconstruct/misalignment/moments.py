@@ -1,12 +1,9 @@
-"""Misalignment within a known tolerance, treated as noise by a robust estimator.
+"""Misalignment within a known tolerance: the moments of H, and what it costs an estimator that does not expect it.
 
 Let a sub-imager's H depend on parameters t, distributed as its tolerance says. With D = H(t) - E[H], images of mean f0
-and covariance P0, and t independent of the image, measurements have the moments
+and covariance P0, and t independent of the image, readings have the mean E[H] f0, and beside Rv the covariance
 
-    mean E[H] f0,   covariance with f  P0 E[H]^T,   covariance  E[H] P0 E[H]^T + E[D (P0 + f0 f0^T) D^T] + Rv.
-
-So the best linear estimator is Eq. 4 of Wood et al. with E[H] for H and one dense block of additional noise for each
-sub-imager, and Eq. 5 with both holds on average over images and cameras. E[H] is slightly blurred.
+    E[H] P0 E[H]^T + E[D (P0 + f0 f0^T) D^T].
 
 H is piecewise smooth: edges of sensor pixels move by sums of parameters, and H has a kink wherever one coincides with
 an edge of a texel, as all do in the camera as designed. A derivative there is of little use, so moments are sums over
@@ -16,10 +13,10 @@ same levels, and every two of them all pairs of levels equally often. Means of p
 are therefore products of means, and the levels give E|t|, E t^2 and E|t|^3 of a normal variable exactly. A parameter
 has the same levels whatever others there are, so that a vanishing tolerance changes nothing.
 
-An estimator that takes H as designed sees D f more than expected, so that the estimate is off by A D f. Averaged over
-images drawn from the prior and misalignments drawn from the tolerance, that adds to Eq. 5 the diagonals of
+With D' = H(t) minus the estimator's H, the estimate is off by A D' f. Averaged over images drawn from the prior and
+misalignments drawn from the tolerance, that adds to Eq. 5 the diagonals of
 
-    A E[D (P0 + f0 f0^T) D^T] A^T  -  (I - A H) P0 E[D]^T A^T  -  its transpose.
+    A E[D' (P0 + f0 f0^T) D'^T] A^T  -  (I - A H) P0 E[D']^T A^T  -  its transpose.
 """
 
 from __future__ import annotations
@@ -39,7 +36,7 @@ from ommatid.scenes.pose import Misalignment, pose_of
 
 from ..expected_error import solved_columns
 from ..prior import Prior
-from ..problem import Form, Whitening
+from ..problem import Form
 
 # |t| at a quarter of the points each, in standard deviations: the solution of three equations for the mean of |t|,
 # t^2 and |t|^3 with two equal levels. E t^4 is 2.78 instead of 3: no four real levels have all four moments.
@@ -50,10 +47,6 @@ ORDER = 8  # of the Galois field, and number of signed levels
 MODULUS = 0b1011  # x^3 + x + 1
 PARAMETERS = 6  # position x and y, tilt about x and about y, rotation, focal length: the columns of every table here
 CAUSE = "misalignment"  # in the error budget
-NEEDS_NOISE = (
-    "estimator.misalignment = 'robust' needs noise in every measurement, got some without; set noise.variance or"
-    " estimator.noise_variance to a number above 0"
-)
 
 
 def points_of(free: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -80,7 +73,7 @@ def _product(first: int, second: int) -> int:
 
 
 @dataclass(frozen=True)
-class MisalignmentNoise:
+class MisalignedMoments:
     """E[H] as `matrix`, (M, N), and `covariances`, for each sub-imager E[D (P0 + f0 f0^T) D^T], (pixels, pixels)."""
 
     matrix: sparse.csr_array
@@ -118,8 +111,8 @@ def misaligned_matrix(camera: Camera, table: FloatArray) -> sparse.csr_array:
     return footprints(camera, tuple(pose_of(sub, misalignment) for sub, misalignment in pairs))
 
 
-def robust_noise(camera: Camera, prior: Prior) -> MisalignmentNoise:
-    """Return E[H] and the noise that misalignment adds, for images drawn from the prior.
+def misaligned_moments(camera: Camera, prior: Prior) -> MisalignedMoments:
+    """Return the moments of H and of what it sees of images drawn from the prior.
 
     The parameters are independent normal ones, with the camera's tolerance for their standard deviations.
     """
@@ -137,19 +130,7 @@ def robust_noise(camera: Camera, prior: Prior) -> MisalignmentNoise:
             _add_squares(blocks, slices, change, prior, weight)
         _add_squares(blocks, slices, shift, prior, -1.0)
         mean = start + shift
-    return MisalignmentNoise(sparse.csr_array(mean), tuple(blocks))
-
-
-def whitening(
-    camera: Camera, misaligned: MisalignmentNoise, noise_variance: FloatArray, used: BoolArray | None = None
-) -> Whitening:
-    """Factorise the covariance of misalignment and independent noise together.
-
-    used : (M,) the measurements used, absent: all;  noise_variance : (pixels used,)
-    Raises InputError where some noise is missing, so that a block is singular.
-    """
-    chosen = np.ones(camera.measurements, dtype=np.bool_) if used is None else used
-    return Whitening.of(_used_blocks(chosen, misaligned, camera.slices()), noise_variance, NEEDS_NOISE)
+    return MisalignedMoments(sparse.csr_array(mean), tuple(blocks))
 
 
 def _add_squares(
@@ -173,11 +154,11 @@ def misalignment_variance(form: Form, used: BoolArray, camera: Camera, prior: Pr
 
     form : of the camera's designed H, for the measurements `used`, (M,)
     """
-    return mismatch_variance(form, used, robust_noise(camera, prior), camera.slices(), prior)
+    return mismatch_variance(form, used, misaligned_moments(camera, prior), camera.slices(), prior)
 
 
 def mismatch_variance(
-    form: Form, used: BoolArray, moments: MisalignmentNoise, slices: list[slice], prior: Prior
+    form: Form, used: BoolArray, moments: MisalignedMoments, slices: list[slice], prior: Prior
 ) -> FloatArray:
     """Return what the difference of the camera's H from the form's adds to Eq. 5, for images of the prior: (N,).
 
@@ -199,7 +180,7 @@ def mismatch_variance(
 
 
 def mismatch_of_image(
-    form: Form, used: BoolArray, moments: MisalignmentNoise, slices: list[slice], image: FloatArray
+    form: Form, used: BoolArray, moments: MisalignedMoments, slices: list[slice], image: FloatArray
 ) -> FloatArray:
     """Return what the same difference adds to the expected squared error of one image, (N,): (N,).
 
@@ -213,12 +194,12 @@ def mismatch_of_image(
     return squares + 2 * bias * form.gain(_shift(form, used, moments) @ image)
 
 
-def _shift(form: Form, used: BoolArray, moments: MisalignmentNoise) -> sparse.csr_array:
+def _shift(form: Form, used: BoolArray, moments: MisalignedMoments) -> sparse.csr_array:
     """Return E[D] of the measurements used."""
     return sparse.csr_array(moments.matrix[used] - form.problem.matrix)
 
 
-def _used_blocks(used: BoolArray, moments: MisalignmentNoise, slices: list[slice]) -> list[tuple[slice, FloatArray]]:
+def _used_blocks(used: BoolArray, moments: MisalignedMoments, slices: list[slice]) -> list[tuple[slice, FloatArray]]:
     """Return the rows among the measurements used, and the covariance of what they see, of every sub-imager."""
     if not moments.covariances:
         return []

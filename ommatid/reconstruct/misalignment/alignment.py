@@ -1,6 +1,4 @@
-"""Methods that expect a misaligned camera: with additional noise, or with an H fitted to the stack.
-
-Both start from H of the camera as designed, and need a dense problem. The fit is one posterior, linearised again.
+"""H of a misaligned camera fitted to the stack itself: one dense posterior, linearised again.
 
 Sub-imagers see the same image, so their measurements determine their relative positions. With misalignments t in units
 of their tolerance and the image f~ of the step before, measurements are about
@@ -31,13 +29,13 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.pose import Misalignment
 
-from ..expected_error import CorrelatedNoise, Interval
+from ..expected_error import Interval
 from ..forms.cholesky import factorise_positive
 from ..methods.dense_method import DenseMethod
 from ..methods.method import Conditions, MethodResult, Value
 from ..prior import Prior
 from ..problem import gram
-from .robust_noise import CAUSE, as_misalignments, misaligned_matrix, robust_noise, tolerances, whitening
+from .moments import CAUSE, as_misalignments, misaligned_matrix, tolerances
 
 MAX_ITERATIONS = 30
 WHOLE_STEPS = 12  # after which steps are shortened, so that they do not go to and fro across a kink
@@ -182,26 +180,6 @@ def _variance(pixels: FloatArray, prior: Prior) -> FloatArray:
     if prior.independent:
         return prior.variance * np.diagonal(pixels)
     return np.einsum("ij,ij->i", prior.root @ pixels, prior.root)
-
-
-class RobustMethod(DenseMethod):
-    """Rv holds E[dH P0 dH^T] of every sub-imager's misalignment within its tolerance."""
-
-    @cached_property
-    def observation(self) -> tuple[sparse.csr_array, CorrelatedNoise]:
-        """E[H] of the measurements used, and their noise with that of misalignment."""
-        task = self.task
-        misaligned = robust_noise(task.model.camera, task.prior_on(task.shape))
-        white = whitening(task.model.camera, misaligned, task.expected_noise, task.used)
-        return misaligned.matrix[task.used], CorrelatedNoise(white, CAUSE, np.zeros(task.expected_noise.size))
-
-    def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
-        """Return the estimate and its error with the given noise and misalignment as its tolerance says.
-
-        There is no interval for a given image: misalignment acts on it otherwise than on images of the prior.
-        """
-        del truth
-        return super().result_for_assumed_prior(noise, None)
 
 
 class AlignedMethod(DenseMethod):

@@ -1,4 +1,4 @@
-"""Misalignment as noise: moments against random cameras, and the error of the robust estimator over them."""
+"""Moments of H of misaligned cameras, against random cameras."""
 
 from __future__ import annotations
 
@@ -7,22 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import linalg, stats
+from scipy import stats
 
-from ommatid.reconstruct.estimator.estimate import estimate
-from ommatid.reconstruct.expected_error import CorrelatedNoise, expected_error
-from ommatid.reconstruct.misalignment.robust_noise import (
-    CAUSE,
-    MisalignmentNoise,
+from ommatid.reconstruct.misalignment.moments import (
     as_misalignments,
     misaligned_matrix,
+    misaligned_moments,
     points_of,
-    robust_noise,
     tolerances,
-    whitening,
 )
 from ommatid.reconstruct.prior import Prior, exponential, independent
-from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
@@ -32,7 +26,6 @@ from ommatid.scenes.tables.camera import Surface
 
 from ..examples import POSITION, TOLERANCES, as_table, drawn_from, misaligned_camera
 
-NOISE = 1e-2
 SIGNIFICANCE = 0.01
 SIDE = 12
 
@@ -92,7 +85,7 @@ def test_tables_hold_the_drawn_misalignments() -> None:
 )
 def test_moments_agree_with_random_cameras_and_images(name: str, tolerance: dict[str, Any]) -> None:
     camera, rng, prior = misaligned_camera(tolerance=tolerance), np.random.default_rng(1), priors()[name]
-    misaligned, draws = robust_noise(camera, prior), 300
+    misaligned, draws = misaligned_moments(camera, prior), 300
     residuals = np.empty((draws, camera.measurements))
     for draw in range(draws):
         residuals[draw] = (drawn_matrix(camera, rng) - misaligned.matrix) @ drawn_from(prior, rng)
@@ -107,75 +100,14 @@ def test_moments_agree_with_random_cameras_and_images(name: str, tolerance: dict
     assert np.abs(z).max() < 5
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["independent", "exponential"])
-def test_error_over_images_and_cameras_is_as_expected_and_below_that_of_trust(name: str) -> None:
-    camera, rng, prior = misaligned_camera(), np.random.default_rng(2), priors()[name]
-    noise = np.full(camera.measurements, NOISE)
-    misaligned = robust_noise(camera, prior)
-    white = whitening(camera, misaligned, noise)
-    robust = estimate(white.problem(misaligned.matrix, prior), white.vector(noise)).form
-    ideal = misaligned_matrix(camera, np.zeros_like(tolerances(camera)))
-    trust = estimate(Problem(ideal, prior, noise), noise).form
-    correlated = CorrelatedNoise(white, CAUSE, np.zeros(noise.size))
-    expected = expected_error(robust, {"noise": noise}, correlated=correlated)
-    errors: list[tuple[float, float]] = []
-    for _ in range(120):
-        image = drawn_from(prior, rng)
-        values = drawn_matrix(camera, rng) @ image + NOISE**0.5 * rng.standard_normal(noise.size)
-        by_robust = prior.mean + robust.gain(white.vector(values - misaligned.matrix @ prior.mean))
-        by_trust = prior.mean + trust.gain(values - ideal @ prior.mean)
-        errors.append((float(np.mean((by_robust - image) ** 2)), float(np.mean((by_trust - image) ** 2))))
-    robust_mse, trust_mse = np.array(errors).T
-    z = (robust_mse.mean() - expected.mse) / (robust_mse.std() / robust_mse.size**0.5)
-    assert abs(z) < stats.norm.isf(SIGNIFICANCE / 2)
-    assert robust_mse.mean() < trust_mse.mean()
-    assert expected.missing + sum(expected.parts.values()) == pytest.approx(expected.mse, rel=1e-9)
-
-
-def test_parts_of_the_error_agree_with_dense_matrices() -> None:
-    camera, prior = misaligned_camera(), priors()["exponential"]
-    noise = np.random.default_rng(3).uniform(0.01, 0.1, camera.measurements)
-    misaligned = robust_noise(camera, prior)
-    white = whitening(camera, misaligned, noise)
-    form = estimate(white.problem(misaligned.matrix, prior), white.vector(noise)).form
-    correlated = CorrelatedNoise(white, CAUSE, np.zeros(noise.size))
-    expected = expected_error(form, {"noise": noise}, correlated=correlated)
-    block, h = linalg.block_diag(*misaligned.covariances), misaligned.matrix.toarray()
-    p = prior.root @ prior.root.T
-    a = np.linalg.solve(h @ p @ h.T + block + np.diag(noise), h @ p).T
-    assert expected.parts["noise"] == pytest.approx(np.trace(a @ np.diag(noise) @ a.T) / len(p), rel=1e-6)
-    assert expected.parts["misalignment"] == pytest.approx(np.trace(a @ block @ a.T) / len(p), rel=1e-6)
-    assert expected.degrees_of_freedom == pytest.approx(np.trace(a @ h), rel=1e-6)
-
-
-def test_pixels_left_out_are_left_out_of_the_blocks() -> None:
-    camera, prior = misaligned_camera(), priors()["independent"]
-    used = np.random.default_rng(5).random(camera.measurements) < 0.8
-    noise = np.full(int(used.sum()), NOISE)
-    misaligned = robust_noise(camera, prior)
-    white = whitening(camera, misaligned, noise, used)
-    whole = linalg.block_diag(*misaligned.covariances)[np.ix_(used, used)] + np.diag(noise)
-    values = np.random.default_rng(6).standard_normal(noise.size)
-    assert white.vector(values) @ white.vector(values) == pytest.approx(values @ np.linalg.solve(whole, values))
-    np.testing.assert_allclose(white.multipliers(white.vector(values)), np.linalg.solve(whole, values))
-
-
 def test_without_tolerance_nothing_is_added() -> None:
     camera = replace(misaligned_camera(), tolerance=None)
-    misaligned = robust_noise(camera, priors()["independent"])
+    misaligned = misaligned_moments(camera, priors()["independent"])
     assert not any(block.any() for block in misaligned.covariances)
 
 
-def test_missing_noise_and_blurred_lenses_are_refused() -> None:
+def test_blurred_lenses_are_refused() -> None:
     camera = misaligned_camera()
-    misaligned = robust_noise(camera, priors()["independent"])
-    with pytest.raises(InputError, match="needs noise in every measurement"):
-        whitening(
-            camera,
-            MisalignmentNoise(misaligned.matrix, tuple(0 * block for block in misaligned.covariances)),
-            np.zeros(camera.measurements),
-        )
     real = Surface.model_validate({"radius": "1 mm", "semi_diameter": "0.1 mm"})
     for optics in (LensOptics(surfaces=(real,)), LensOptics(aperture=0.1, focus=500.0)):
         lens_type = replace(camera.types[0], optics=optics)

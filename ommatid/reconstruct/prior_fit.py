@@ -42,7 +42,7 @@ EXPONENTS = (1.0, 2.0, 3.0, 4.0)  # and 0, which has no length
 WINDOW = 16  # pixels of f, side of a window
 WHOLE = 22  # pixels of f, side of the largest image that is one window, and
 WHOLE_WIDE = 32  # of one in front of wide footprints
-WIDEST = 24  # pixels of f, side of the widest window of larger ones; what lies beside it counts as noise
+WIDEST = 24  # pixels of f, side of the widest window of larger ones
 NATURAL_EXPONENT, NATURAL_LENGTH = 2.0, 10.0  # of a picture that is not known; pixels of f
 PER_AXIS = 3  # windows along an axis
 MOST = 400  # measurements of a window of more pixels
@@ -161,13 +161,23 @@ class Place:
         return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
 
     def window(self, task: EstimationTask, noise: FloatArray) -> Window:
-        """Return the measurements in units of `noise`, (measurements used,), to which what they see beside it adds."""
+        """Return the measurements, whitened for `noise`, (measurements used,), and for what they see beside the window.
+
+        What they see there is an average over many pixels, about the same for all, by as much as they lose of the light.
+        """
         fine, _ = _unknowns(task)
         matrix = np.asarray(fine.windowed.rows_on(self.numbers, self.rows, self.columns).toarray())
-        beside = np.square(self.light - matrix.sum(axis=1)) * float(np.mean(self.residual**2))
-        deviation = np.sqrt(noise[task.among_used(self.numbers)] + beside)
+        deviation = np.sqrt(noise[task.among_used(self.numbers)])
+        beside = (self.light - matrix.sum(axis=1)) * float(np.mean(self.residual**2)) ** 0.5 / deviation
+        square = float(beside @ beside)
+        share = (1 - (1 + square) ** -0.5) / square if square else 0.0
+
+        def white(values: FloatArray) -> FloatArray:
+            scaled = (values.T / deviation).T
+            return scaled - share * np.multiply.outer(beside, beside @ scaled)
+
         level = task.prior.level_deviation * self.light
-        return Window.of(matrix / deviation[:, None], self.shape, self.residual / deviation, level / deviation)
+        return Window.of(white(matrix), self.shape, white(self.residual), white(level))
 
 
 @dataclass(frozen=True)

@@ -163,7 +163,7 @@ class Place:
     def window(self, task: EstimationTask, noise: FloatArray) -> Window:
         """Return the measurements, whitened for `noise`, (measurements used,), and for what they see beside the window.
 
-        What they see there is an average over many pixels, about the same for all, by as much as they lose of the light.
+        That is an average over many pixels, about the same for all of them, by as much as they lose of the light.
         """
         fine, _ = _unknowns(task)
         matrix = np.asarray(fine.windowed.rows_on(self.numbers, self.rows, self.columns).toarray())

@@ -7,7 +7,8 @@ passes or more, is half of the allowed one, and rounds are planned for a quarter
 by chance lets no bad pixel pass, and few rounds need another. Through pinholes, stratified samples make the variance
 fall like 1 / samples^1.5, since only those at the edges of pixels of f err. Where a grid of samples fits these edges
 none do: such sub-imagers begin with two passes of that grid, one sample per pixel of f (`sampling.passes`), and are
-done where these agree. Behind lenses points are Sobol's (`renderer.draws`) unless another sampler than the default is
+done where these agree. Through displaced pinholes the averages of the picture over each pixel are exact
+(`renderer.averages`). Behind lenses points are Sobol's (`renderer.draws`) unless another sampler than the default is
 asked for. Behind thin lenses the picture is averaged over each pixel exactly (`renderer.averages`), and only the point
 spread is sampled. Behind surfaces a ray has four numbers and more: measured, the variance of Sobol's points is 1.5 to
 1.8 times lower than multijitter's at 256 samples in a pass, 1.9 to 2.3 times at 1024 and 3.1 to 3.3 times at 4096, in
@@ -21,7 +22,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby
-from math import inf
+from math import ceil, exp, inf
 from time import perf_counter
 from typing import Any
 
@@ -48,6 +49,7 @@ from .sampling.passes import (
     Tally,
     cells_of,
     exact_plan,
+    has_grid,
     margin,
     on_grid,
     power_of_two_plan,
@@ -59,6 +61,7 @@ from .world_view import rendered_world
 
 DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, and what a round is planned for
 LEAST = 256  # samples per pixel of a first round, at least
+DARK = WHITE / 16  # light whose noise counts for it
 MOST = 2**20  # samples per pixel of a round, at most
 MOST_EXACT = 2**16  # samples per pixel of a pass whose sums are float64
 MOST_PASSES = 1024  # of all rounds of a sub-imager: they number its seeds
@@ -171,11 +174,11 @@ class AdaptiveRounds:
         self._open = np.ones(setup.camera.measurements, dtype=np.bool_)  # pixels that are not done
         exponent = expected_exponent(setup.scene.render.sampler)
         self._world, flat, sampler = setup.world.simulated, setup.scene.world is None, setup.scene.render.sampler
-        numbers = range(len(self._slices))
-        self._exact = [exact_plan(self._world, index, sampler) if flat else None for index in numbers]
+        plans = (exact_plan(self._world, index, sampler, fast=renderer.is_fast) for index in range(len(self._slices)))
+        self._exact = [plan if flat else None for plan in plans]
         quasi_random = flat and renderer.is_fast and sampler == "multijitter"
         self._sobol = [quasi_random and sub.type.optics.has_width for sub in self._world.sub_imagers]
-        plans = [self._grid(index, LEAST) if exact is None else exact for index, exact in enumerate(self._exact)]
+        plans = [self._first(index) if exact is None else exact for index, exact in enumerate(self._exact)]
         self.sub_imagers = [SubImagerProgress(work, exponent) for work in plans]
 
     @property
@@ -209,15 +212,23 @@ class AdaptiveRounds:
 
     @property
     def exact(self) -> list[list[int]]:
-        """Indices of the sub-imagers that a grid has yet to show without error; a list of those rendered together."""
+        """Indices of the sub-imagers that have yet to be shown without error; a list of those rendered together.
+
+        They are adjacent, of one lens type, and a grid fits all or none.
+        """
         waiting = [index for index, sub in enumerate(self.sub_imagers) if self._exact[index] and not sub.rounds]
-        types = groupby(waiting, lambda index: self._camera.sub_imagers[index].type.name)
-        return [list(indices) for _, indices in types]
+
+        def kind(numbered: tuple[int, int]) -> tuple[str, bool, int]:
+            number, index = numbered
+            return self._camera.sub_imagers[index].type.name, has_grid(self._world, index), index - number
+
+        return [[index for _, index in alike] for _, alike in groupby(enumerate(waiting), kind)]
 
     def render_exact(self, indices: list[int]) -> Iterator[float]:
-        """Render adjacent sub-imagers of one lens type on their exact grid, and yield the finished share of them.
+        """Render adjacent sub-imagers of one lens type without error, and yield the finished share of them.
 
-        Pixels whose passes agree are done: their variance is float32's rounding. The others take part in the rounds.
+        Averages are done, and of a grid pixels whose passes agree: their variance is float32's rounding. The others
+        take part in the rounds.
         """
         work, seed = self.sub_imagers[indices[0]].next, self._scene.render.seed
         seeds = [sampler_seeds(seed, "data", number, MOST_PASSES) for number in range(work.passes)]
@@ -229,7 +240,7 @@ class AdaptiveRounds:
             mean, variance = tally.mean, tally.variance
             floor = rounding_variance(mean, self._renderer.float32_samples(work.samples))
             self.mean[part], self.variance[part] = mean, np.maximum(variance, floor)
-            self._open[part] = variance > floor
+            self._open[part] = (variance > floor) & has_grid(self._world, indices[0])
             yield (part.stop - rows.start) / (rows.stop - rows.start)
         for index in indices:
             self.sub_imagers[index] = self._after_exact(index, work)
@@ -239,7 +250,7 @@ class AdaptiveRounds:
         sub.add_round(work, np.zeros(still.size))
         sub.fewest = 0 if still.all() else sub.spent
         if still.any():
-            sub.next = self._grid(index, LEAST)
+            sub.next = self._first(index)
         else:
             self._end(sub, index, FLOAT32)
         return sub
@@ -318,6 +329,21 @@ class AdaptiveRounds:
         rows = self._slices[index]
         beyond = self.variance[rows] > self._allowed(self.mean[rows], rows)
         sub.ended, sub.fewest = why if beyond.any() else REACHED, sub.fewest or sub.spent
+
+    def _first(self, index: int) -> Plan:
+        """Return the plan of a first round, whose scatter shows every edge that matters.
+
+        Of the strata of a pass a strip of width q beyond an edge of the picture is seen by g samples with probability
+        q, and is R q / g of the reading, with g x g strata and a contrast R. That none of the n = 16 g^2 samples sees
+        it has the probability exp(-16 g q), and its square times that is at most (R / (8 g^2))^2 / e^2.
+        """
+        if self._sobol[index]:
+            return self._grid(index, LEAST)
+        rows = self._slices[index]
+        allowed = self._allowed(np.broadcast_to(DARK, rows.stop - rows.start), rows)
+        aim = AIM * min((float(each) for each in allowed if each > 0), default=inf)
+        seen = 2 * WHITE / (exp(1) * aim**0.5)
+        return self._grid(index, min(max(LEAST, ceil(seen)), MOST))
 
     def _grid(self, index: int, samples: int, most: int = MOST_SAMPLES) -> Plan:
         """Return a plan that fits the edges of pixels of f or Sobol's points, where the sampler can make use of it."""
@@ -420,16 +446,18 @@ def expose_exactly(
         no other one: on the fast backends all start together, on scalar they are rendered one by one.
     """
     slices = camera.slices()
-    if renderer.is_fast:
+    if not has_grid(camera, indices[0]):
+        yield from renderer.expose_averages(indices)
+    elif renderer.is_fast:
         keys = np.array([[seed(index) for seed in seeds] for index in range(len(slices))], dtype=np.int64)
         rows = slice(slices[indices[0]].start, slices[indices[-1]].stop)
         yield from renderer.expose_grid(rows, work, margin(camera, camera.sub_imagers[indices[0]].type), keys)
-        return
-    for index in indices:
-        rows, columns = camera.sub_imagers[index].type.pixels
-        pixels: IntArray = np.arange(rows * columns)
-        values = renderer.expose_alone(index, pixels, work, lambda number, index=index: seeds[number](index))
-        yield slices[index], values
+    else:
+        for index in indices:
+            rows, columns = camera.sub_imagers[index].type.pixels
+            pixels: IntArray = np.arange(rows * columns)
+            values = renderer.expose_alone(index, pixels, work, lambda number, index=index: seeds[number](index))
+            yield slices[index], values
 
 
 def check_noise_target(scene: Scene) -> None:

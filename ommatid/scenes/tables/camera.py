@@ -91,6 +91,11 @@ class ToleranceTable(Table):
     )
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the random draw: another seed is another camera")
 
+    @property
+    def displaces(self) -> bool:
+        """True if lenses are displaced and nothing else is misaligned."""
+        return not (self.tilt or self.rotation or self.focal_length)
+
 
 class SubImagerTable(Table):
     """One sub-imager of an array that looks at a window of its own."""

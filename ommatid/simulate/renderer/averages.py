@@ -5,7 +5,8 @@ which the point displaces. The average of a picture of even pixels over a box of
 displacement between those of whole pixels. So rays from the pixel's middle meet the averages by bilinear interpolation,
 and what is left to chance is the point spread alone. A ratio p / q takes a picture of q x q times as many pixels.
 
-The light of a pixel's corners falls off by other angles: to first order the first moments of the boxes show it.
+The light of a pixel's corners falls off by other angles: to first order the first moments of the boxes show it. Through
+a pinhole nothing is left to chance.
 """
 
 # pyright: basic
@@ -18,17 +19,6 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-
-MOST_PIXELS = 64  # of a box along an axis
-MOST_PARTS = 4  # of a pixel of the picture along an axis
-
-
-def has_averages(camera: Camera, lens_type: LensType) -> bool:
-    """Return True if all pixels of a lens type throw equal boxes along the axes of the picture."""
-    optics, ratio = lens_type.optics, lens_type.ratio
-    thin = optics.aperture is not None and optics.surfaces is None and optics.distortion is None
-    small = ratio.numerator <= MOST_PIXELS and ratio.denominator <= MOST_PARTS
-    return thin and small and camera.walls and camera.tolerance is None and not lens_type.is_rotated
 
 
 class Averages:
@@ -51,18 +41,20 @@ class Averages:
         texture: Any = mi.Texture2f
         self._texture = texture(mi.TensorXf(data), filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Clamp)
 
-    def light(self, ray: Any, falloff: tuple[Any, Any]) -> Any:
+    def light(self, ray: Any, falloff: tuple[Any, Any] = (0.0, 0.0), moved: tuple[float, float] = (0.0, 0.0)) -> Any:
         """Return the radiance that the pixels of rays from their middles meet.
 
         falloff : relative change of the light's weight across a pixel, down and across, of each ray
+        moved : displacement of the boxes, down and across, in parts of a pixel of the picture
         """
         import mitsuba as mi
 
         camera, along = self._camera, (self._camera.distance - ray.o.z) / ray.d.z
         middle = [camera.rows / 2 - (ray.o.y + along * ray.d.y) / camera.target_pitch]
         middle.append(camera.columns / 2 - (ray.o.x + along * ray.d.x) / camera.target_pitch)
+        first = self._box / 2 + 0.5
         v, u = (
-            (self._parts * each + self._box / 2 + 0.5) / size for each, size in zip(middle, self._shape, strict=True)
+            (self._parts * each + first + by) / size for each, by, size in zip(middle, moved, self._shape, strict=True)
         )
         mean, down, across = self._texture.eval(mi.Point2f(u, v))
         return mean + falloff[0] * down + falloff[1] * across

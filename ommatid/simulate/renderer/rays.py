@@ -134,6 +134,13 @@ class RayGenerator:
         slope = -4 * self._pitch / (x * x + y * y + z * z)  # of cos^4
         return ray, (slope * y, slope * x)
 
+    def middles(self, pixels: IntArray) -> Rays:
+        """Start the ray from the middle of each of some pixels of the group, of pinholes."""
+        import mitsuba as mi
+
+        places = self._load(slice(0, pixels.size), pixels)
+        return Rays(*self._emit(places, 1, pixels.size, mi.Point2f(0.5), None), 1)
+
     def grid_rays(self, grid: Grid, passes: int, keys: IntArray, pixels: IntArray) -> Rays:
         """Start one ray per cell of a grid over each pixel and pass, of pinholes, by random numbers of each pixel.
 

@@ -9,7 +9,7 @@ and can round up to the next one's.) Around the target, or instead of it, there 
 # pyright: basic
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from math import isqrt
 from typing import TYPE_CHECKING, Any
@@ -25,9 +25,9 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.estimation import Sampler
 
-from ..sampling.passes import Plan
+from ..sampling.passes import Plan, has_equal_boxes, margin
 from ..sampling.samplers import fitting
-from .averages import Averages, has_averages
+from .averages import Averages
 from .draws import Grid
 from .plugins import black, depths, scene_of, stock_sensors, target_of
 from .variant import activate, check_fast_variant, ignored_samples
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from .rays import RayGenerator, Rays
     from .world import StagedWorld
 
+TYPICAL = 0.5  # of the most by which float32 may move a point
 EXACT_SUMS = 2**22, 2**50  # float32 sums of whole numbers below, and float64 ones, lose less than 1/4
 MOST_TEXELS = 2**24  # that float32 can number
 FAR = 1e4  # in distances of the target: how far stock sensors see into a world
@@ -214,6 +215,24 @@ class Renderer:
             rays = generator.grid_rays(grid, work.passes, keys, np.arange(part.start - first, part.stop - first))
             yield part, self._readings(group, rays).reshape(-1, work.passes).T
 
+    def expose_averages(self, indices: Sequence[int]) -> Iterator[tuple[slice, FloatArray]]:
+        """Yield the readings of adjacent sub-imagers of pinholes whose pixels throw equal boxes, as `expose_grid` does.
+
+        Of the four passes each is displaced along an axis by what float32 may round. Only on the fast backends.
+        """
+        subs, slices = [self.camera.sub_imagers[index] for index in indices], self.camera.slices()
+        group, lens_type = next(name for name, types in self.groups.items() if subs[0].type in types), subs[0].type
+        generator, averages = self._generators[group], self._averages_of(lens_type)
+        if averages is None:
+            raise ValueError("expected pixels that throw equal boxes on a flat picture")
+        first, stop, start = slices[indices[0]].start, slices[indices[-1]].stop, self.rows(group).start
+        away = TYPICAL * margin(self.camera, lens_type)
+        for block in generator.blocks(1, stop - first):
+            part = slice(first + block.start, first + block.stop)
+            rays = generator.middles(np.arange(part.start - start, part.stop - start))
+            met = (averages.light(rays.ray, moved=by) for by in ((away, 0), (-away, 0), (0, away), (0, -away)))
+            yield part, np.stack([self._weighed(group, rays, light) for light in met])
+
     def blocks(self, group: str, samples: int, subset: IntArray | None = None) -> list[slice]:
         """Divide the pixels of a group into blocks whose rays start together. Only on the fast backends."""
         pixels = None if subset is None else subset.size
@@ -245,7 +264,7 @@ class Renderer:
 
     def _averages_of(self, lens_type: LensType) -> Averages | None:
         """Return the picture's averages over the boxes of a lens type, None where these are not equal."""
-        if self._picture is None or not has_averages(self.camera, lens_type):
+        if self._picture is None or not has_equal_boxes(self.camera, lens_type):
             return None
         if lens_type.name not in self._averages:
             self._averages[lens_type.name] = Averages(self.camera, lens_type, self._picture * self._unit)

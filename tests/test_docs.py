@@ -12,6 +12,7 @@ import shutil
 import tomllib
 import zipfile
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -115,6 +116,14 @@ def reduce_starter(path: Path) -> None:
     path.write_text(text.replace(STARTER_SHAPE, SMALL_SHAPE), encoding="utf-8")
 
 
+def check_imports(code: ast.Module) -> None:
+    """What a page imports of the program exists."""
+    for node in ast.walk(code):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("ommatid"):
+            module = import_module(node.module or "")
+            assert [each.name for each in node.names if not hasattr(module, each.name)] == [], node.module
+
+
 @pytest.mark.parametrize("page", PAGES, ids=page_name)
 def test_code_blocks_of_a_page_are_read(page: Path, tmp_path: Path, ommatid: Command) -> None:
     """The short form: commands are parsed, Python is compiled, scenes are read, and closed forms are computed."""
@@ -130,7 +139,7 @@ def test_code_blocks_of_a_page_are_read(page: Path, tmp_path: Path, ommatid: Com
                 if arguments[0] == "predict" and "--no-rays" in arguments and arguments[1].startswith("tile"):
                     run_command(line, comment, tmp_path, ommatid)
         elif block.language == "python":
-            ast.parse(block.text)
+            check_imports(ast.parse(block.text))
         elif block.language == "toml":
             parse_toml(block)
         else:

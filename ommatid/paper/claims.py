@@ -7,14 +7,13 @@ otherwise the estimator expects the actual noise. Claims on photographs are chec
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import combinations
 from math import inf, isfinite
 
 import numpy as np
 
 from ommatid.reconstruct.measured_error import TRIM
-from ommatid.reconstruct.methods.tile_solver import Posterior, disjoint_tiles, merge_posteriors, tile_posterior
+from ommatid.reconstruct.methods.tile_solver import disjoint_tiles, merge_tiles, tile_posterior
 from ommatid.reconstruct.prediction import observability
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
@@ -317,9 +316,10 @@ def _joined(tiles: Tiles) -> Claim:
     holds = True
     for lenses in (TWO, THREE):
         whole = tiles[JOINED_SIDE, lenses]
-        parts = _parts(whole)
-        apart = float(np.concatenate([part.variance for part in parts]).mean())
-        joined = _join(whole, parts).variance
+        half, problem = -(-whole.side // PARTS), _quiet(whole)
+        tiles_of, recorded = disjoint_tiles(whole.camera.shape, (half, half)), np.zeros(problem.measurements)
+        parts = [tile_posterior(problem, recorded, pixels).variance for pixels in tiles_of]
+        apart, joined = float(np.concatenate(parts).mean()), merge_tiles(problem, recorded, tiles_of).variance
         difference = float(np.abs(joined / whole.matched(LEAST) - 1).max())
         holds &= difference < EQUAL and apart > whole.mse(LEAST)
         numbers[f"{whole.name}: error of four parts of the {whole.side} x {whole.side} tile"] = apart
@@ -327,20 +327,6 @@ def _joined(tiles: Tiles) -> Claim:
         numbers[f"{whole.name}: error of the whole tile"] = whole.mse(LEAST)
         numbers[f"{whole.name}: largest relative difference of a pixel"] = difference
     return Claim("joining tiles by Eq. 7 brings what a larger tile brings", verdict(holds), numbers)
-
-
-def _parts(whole: PaperTile) -> list[Posterior]:
-    half = -(-whole.side // PARTS)
-    problem = _quiet(whole)
-    return [
-        tile_posterior(problem, np.zeros(problem.measurements), pixels)
-        for pixels in disjoint_tiles(whole.camera.shape, (half, half))
-    ]
-
-
-def _join(whole: PaperTile, parts: list[Posterior]) -> Posterior:
-    problem = _quiet(whole)
-    return reduce(lambda one, other: merge_posteriors(one, other, problem, np.zeros(problem.measurements)), parts)
 
 
 def _quiet(whole: PaperTile) -> Problem:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import reduce
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +13,7 @@ from ommatid.reconstruct.methods.tile_solver import (
     Posterior,
     disjoint_tiles,
     merge_posteriors,
+    merge_tiles,
     tile_posterior,
 )
 from ommatid.reconstruct.prior import Prior, exponential, independent
@@ -62,12 +61,6 @@ def assert_same(first: Posterior, second: Posterior, tolerance: float) -> None:
     np.testing.assert_allclose(first.mean, second.mean, rtol=0, atol=tolerance * size)
     difference = np.abs(first.covariance - second.covariance)
     assert (difference <= tolerance * np.outer(deviation, deviation)).all()
-
-
-def merge_tiles(problem: Problem, recorded: FloatArray, tiles: list[Indices]) -> Posterior:
-    """The posterior of all tiles together: each is estimated alone and merged with those before it."""
-    posteriors = (tile_posterior(problem, recorded, tile) for tile in tiles)
-    return reduce(lambda merged, tile: merge_posteriors(merged, tile, problem, recorded), posteriors)
 
 
 @pytest.mark.parametrize("noise", [1e-2, 1e-6])

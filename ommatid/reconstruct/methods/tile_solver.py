@@ -22,8 +22,9 @@ to 3e-9 at 1e-10 (the paper's lenses).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import product
 
 import numpy as np
@@ -104,6 +105,18 @@ def merge_posteriors(first: Posterior, second: Posterior, problem: Problem, reco
     root: FloatArray = linalg.block_diag(first.root, second.root)
     coupling = _inside(problem, pixels) & ~_inside(problem, first.pixels) & ~_inside(problem, second.pixels)
     return _updated(Posterior(pixels[order], mean[order], root[order]), problem, recorded, np.flatnonzero(coupling))
+
+
+def merge_tiles(problem: Problem, recorded: FloatArray, tiles: Sequence[Indices]) -> Posterior:
+    """Return the posterior of all `tiles` together: each is estimated alone and merged with those before it.
+
+    If the tiles partition the frame, all measurements are used. Raises InputError as `tile_posterior` and
+    `merge_posteriors` do.
+    """
+    if not tiles:
+        raise InputError("expected one tile or more to merge, got none")
+    posteriors = (tile_posterior(problem, recorded, tile) for tile in tiles)
+    return reduce(lambda merged, tile: merge_posteriors(merged, tile, problem, recorded), posteriors)
 
 
 def _inside(problem: Problem, pixels: Indices) -> BoolArray:

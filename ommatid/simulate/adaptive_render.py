@@ -61,6 +61,7 @@ from .world_view import rendered_world
 
 DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, and what a round is planned for
 LEAST = 256  # samples per pixel of a first round, at least
+MOST_FIRST = 2**14  # and at most
 DARK = WHITE / 16  # light whose noise counts for it
 MOST = 2**20  # samples per pixel of a round, at most
 MOST_EXACT = 2**16  # samples per pixel of a pass whose sums are float64
@@ -335,15 +336,16 @@ class AdaptiveRounds:
 
         Of the strata of a pass a strip of width q beyond an edge of the picture is seen by g samples with probability
         q, and is R q / g of the reading, with g x g strata and a contrast R. That none of the n = 16 g^2 samples sees
-        it has the probability exp(-16 g q), and its square times that is at most (R / (8 g^2))^2 / e^2.
+        it has the probability exp(-16 g q), and its square times that is at most (R / (8 g^2))^2 / e^2. With a time
+        limit, which holds from the second round on, the first one is short.
         """
-        if self._sobol[index]:
+        if self._sobol[index] or self._scene.render.time is not None:
             return self._grid(index, LEAST)
         rows = self._slices[index]
         allowed = self._allowed(np.broadcast_to(DARK, rows.stop - rows.start), rows)
         aim = AIM * min((float(each) for each in allowed if each > 0), default=inf)
         seen = 2 * WHITE / (exp(1) * aim**0.5)
-        return self._grid(index, min(max(LEAST, ceil(seen)), MOST))
+        return self._grid(index, min(max(LEAST, ceil(seen)), MOST_FIRST, MOST))
 
     def _grid(self, index: int, samples: int, most: int = MOST_SAMPLES) -> Plan:
         """Return a plan that fits the edges of pixels of f or Sobol's points, where the sampler can make use of it."""

@@ -85,7 +85,8 @@ def windows(task: EstimationTask) -> tuple[list[Window], int]:
 def held_out_sums(task: EstimationTask, execution: Execution) -> HeldOutSums:
     """Predict the used pixels of every sub-imager from all others, and sum their squares.
 
-    Sums are 0 where there are no others to predict from."""
+    Sums are 0 where there are no others to predict from.
+    """
     if _knows_detail(task):
         return _sums(_whole_detailed(task))
     chosen, _ = windows(task)

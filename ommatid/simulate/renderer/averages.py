@@ -39,7 +39,9 @@ class Averages:
         self._shape = layers[0].shape
         data = np.ascontiguousarray(np.stack(layers, axis=-1), dtype=np.float32)
         texture: Any = mi.Texture2f
-        self._texture = texture(mi.TensorXf(data), filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Clamp)
+        modes = {"filter_mode": dr.FilterMode.Linear, "wrap_mode": dr.WrapMode.Clamp}
+        # Texture units of a GPU interpolate with 8 bits, a thousandth of a pixel value where float32 has a millionth.
+        self._texture = texture(mi.TensorXf(data), use_accel=False, **modes)
 
     def light(self, ray: Any, falloff: tuple[Any, Any] = (0.0, 0.0), moved: tuple[float, float] = (0.0, 0.0)) -> Any:
         """Return the radiance that the pixels of rays from their middles meet.

@@ -111,6 +111,7 @@ class Cell:
 IDEAL, POINTS = "calibration.method=ideal", "calibration.fit=none"  # points are the scene's method
 COARSE = "render.samples=256"  # so few that rendering is most of the noise
 FITTED = "calibration.fit=geometry"
+FIT = "prior.kind=fit"  # of scenes that get the prior of the paper here
 # Corners of crops of the photograph, each the most extreme in its mean or its standard deviation at that size.
 CROPS_19 = {"bright": (165, 30), "dark": (315, 135), "flat": (145, 25)}
 CROPS_119 = {"bright": (70, 330), "dark": (240, 30), "flat": (20, 290)}
@@ -207,6 +208,13 @@ def _frames() -> Iterable[Cell]:
     misaligned = "camera.tolerance.position=41 nm"
     yield Cell("photo-119-misaligned-896", "photo", (_size(119), misaligned, *_samples(896)), 24)
     yield Cell("sensor119", "sensor119", (), 30)
+    # The default: a fitted prior, and as many samples as the noise justifies.
+    yield Cell("photo-119-I-fit", "photo", (_size(119), FIT), 15, ("I",))
+    yield Cell("photo-119-I+II-fit", "photo", (_size(119), FIT), 15, ("I", "II"))
+    yield Cell("photo-119-0.4mm-fit", "photo", (_size(119), *_apertures("0.4 mm"), FIT), 30)
+    yield Cell("photo-119-misaligned-fit", "photo", (_size(119), misaligned, FIT), 45)
+    yield Cell("doublet119", "doublet119", (), 230)
+    yield Cell("machine_vision", "machine_vision", (), 300, seeds=5)
     # A drawn image is rough, so its rendering is noisy: with few samples the null space would be hidden in that noise.
     framed = (_size(59), IDEAL, "estimator.method=frame", "render.samples=16384")
     yield Cell("photo-59-I+II-prior-frame", "photo", framed, 15, ("I", "II"), drawn=True)

@@ -4,7 +4,7 @@
 other load slows both sides of a ratio alike, so compare ratios rather than times. Run by themselves: `chain`, the time,
 memory and files of every stage of a run from 119 x 119 pixels on, and the campaigns, which continue where they were
 interrupted: `nasty`, half an hour, `pictures`, which measures error bars of eleven kinds of picture for two hours, and
-`coverage`, those of rendered scenes for eight (`coverage --help`). `cells` says in two minutes which cameras are served.
+`coverage`, those of rendered scenes for eight (`coverage --help`). `cells` says in two minutes what is served.
 """
 
 from __future__ import annotations

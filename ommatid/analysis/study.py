@@ -27,7 +27,6 @@ from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 from ommatid.simulate.ideal import ideal_model, true_model
 
 NUMBERS, TABLE = "study.json", "study.csv"
-MISALIGNMENT = {"fitted": "fit"}  # estimator.misalignment by model; "trust" for all others
 LABELS = {
     "ideal": "the ideal H",
     "points": "H of rendered point sources",
@@ -56,7 +55,7 @@ def check_study(scene: Scene, camera: Camera) -> None:
 
 
 def _with_misalignment(scene: Scene, name: str) -> Scene:
-    estimator = scene.estimator.model_copy(update={"misalignment": MISALIGNMENT.get(name, "trust")})
+    estimator = scene.estimator.model_copy(update={"misalignment": "fit" if name == "fitted" else "trust"})
     return scene.model_copy(update={"estimator": estimator})
 
 

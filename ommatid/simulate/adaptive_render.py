@@ -43,13 +43,13 @@ from .renderer.renderer import Renderer
 from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint, State
 from .sampling.passes import (
+    AVERAGED,
     FEWEST_PASSES,
     MOST_SAMPLES,
     Plan,
     Tally,
     cells_of,
     exact_plan,
-    has_grid,
     margin,
     on_grid,
     power_of_two_plan,
@@ -175,11 +175,11 @@ class AdaptiveRounds:
         self._open = np.ones(setup.camera.measurements, dtype=np.bool_)  # pixels that are not done
         exponent = expected_exponent(setup.scene.render.sampler)
         self._world, flat, sampler = setup.world.simulated, setup.scene.world is None, setup.scene.render.sampler
-        plans = (exact_plan(self._world, index, sampler, fast=renderer.is_fast) for index in range(len(self._slices)))
-        self._exact = [plan if flat else None for plan in plans]
+        exact = (exact_plan(self._world, index, sampler, fast=renderer.is_fast) for index in range(len(self._slices)))
+        self._exact = [plan if flat else None for plan in exact]
         quasi_random = flat and renderer.is_fast and sampler == "multijitter"
         self._sobol = [quasi_random and sub.type.optics.has_width for sub in self._world.sub_imagers]
-        plans = [self._first(index) if exact is None else exact for index, exact in enumerate(self._exact)]
+        plans = [self._first(index) if plan is None else plan for index, plan in enumerate(self._exact)]
         self.sub_imagers = [SubImagerProgress(work, exponent) for work in plans]
 
     @property
@@ -215,13 +215,13 @@ class AdaptiveRounds:
     def exact(self) -> list[list[int]]:
         """Indices of the sub-imagers that have yet to be shown without error; a list of those rendered together.
 
-        They are adjacent, of one lens type, and a grid fits all or none.
+        They are adjacent, of one lens type and one plan.
         """
         waiting = [index for index, sub in enumerate(self.sub_imagers) if self._exact[index] and not sub.rounds]
 
-        def kind(numbered: tuple[int, int]) -> tuple[str, bool, int]:
+        def kind(numbered: tuple[int, int]) -> tuple[str, Plan | None, int]:
             number, index = numbered
-            return self._camera.sub_imagers[index].type.name, has_grid(self._world, index), index - number
+            return self._camera.sub_imagers[index].type.name, self._exact[index], index - number
 
         return [[index for _, index in alike] for _, alike in groupby(enumerate(waiting), kind)]
 
@@ -241,7 +241,7 @@ class AdaptiveRounds:
             mean, variance = tally.mean, tally.variance
             floor = rounding_variance(mean, self._renderer.float32_samples(work.samples))
             self.mean[part], self.variance[part] = mean, np.maximum(variance, floor)
-            self._open[part] = (variance > floor) & has_grid(self._world, indices[0])
+            self._open[part] = (variance > floor) & (work != AVERAGED)
             yield (part.stop - rows.start) / (rows.stop - rows.start)
         for index in indices:
             self.sub_imagers[index] = self._after_exact(index, work)
@@ -448,7 +448,7 @@ def expose_exactly(
         no other one: on the fast backends all start together, on scalar they are rendered one by one.
     """
     slices = camera.slices()
-    if not has_grid(camera, indices[0]):
+    if work == AVERAGED:
         yield from renderer.expose_averages(indices)
     elif renderer.is_fast:
         keys = np.array([[seed(index) for seed in seeds] for index in range(len(slices))], dtype=np.int64)

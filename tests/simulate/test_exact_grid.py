@@ -16,7 +16,7 @@ from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import choose
 from ommatid.simulate.sampling import passes
-from ommatid.simulate.sampling.passes import Plan, exact_plan, rounding_variance
+from ommatid.simulate.sampling.passes import AVERAGED, Plan, exact_plan, rounding_variance
 
 from ..examples import VARIANTS, needs, scene, with_optics
 
@@ -87,7 +87,7 @@ def test_pinholes_are_exact_by_grids_or_by_averages() -> None:
     exact = Setup.from_scene(auto())
     assert plans(exact) == {Plan(2, 25), Plan(2, 64)}
     assert plans(exact, "independent") == {None}
-    averages = Plan(4, 1)
+    averages = AVERAGED
     for lens, table, expected in (
         ({"distortion": [0.01, 0.0]}, {}, {None}),
         ({"aperture": "0.1 mm"}, {}, {None}),

@@ -88,8 +88,7 @@ def check_task(
     """Check a task whose noise is known; `method` is that of the estimate. Arguments and errors: `check_held_out`."""
     if method == "fit":
         raise InputError(
-            "estimator.misalignment 'fit' fits H to all sub-imagers at once, so that none is held out; set it to"
-            " 'trust'"
+            "estimator.misalignment 'fit' fits H to all sub-imagers at once, so that none is held out; take 'trust'"
         )
     if not (task.expected_noise > 0).all():
         raise InputError(

@@ -40,7 +40,7 @@ class Averages:
         data = np.ascontiguousarray(np.stack(layers, axis=-1), dtype=np.float32)
         texture: Any = mi.Texture2f
         modes = {"filter_mode": dr.FilterMode.Linear, "wrap_mode": dr.WrapMode.Clamp}
-        # Texture units of a GPU interpolate with 8 bits, a thousandth of a pixel value where float32 has a millionth.
+        # Texture units of a GPU know the place between two averages to 1/256 only.
         self._texture = texture(mi.TensorXf(data), use_accel=False, **modes)
 
     def light(self, ray: Any, falloff: tuple[Any, Any] = (0.0, 0.0), moved: tuple[float, float] = (0.0, 0.0)) -> Any:

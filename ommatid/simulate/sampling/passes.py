@@ -29,7 +29,6 @@ JITTERED: tuple[Sampler, ...] = ("multijitter", "stratified")  # one sample in e
 MOST_CELLS = 16  # along a side of a grid that fits the edges of pixels of f
 ROUNDING = 2.0**-24  # relative, of float32
 EXACT_PASSES = 2  # of such a grid
-AVERAGED_PASSES = 4  # of exact averages: up, down, left and right by what float32 may round
 ROUNDINGS = 16  # of float32, from the sensor to the target: more than add up on a ray's way
 WIDEST_MARGIN = 0.125  # of a cell, beyond which float32 does not resolve the cells
 MOST_PIXELS = 64  # of f, of a sensor pixel along an axis, whose averages are computed
@@ -163,27 +162,25 @@ def power_of_two_plan(samples: int, most: int) -> Plan:
     return Plan(max(FEWEST_PASSES, BATCHES * ceil(samples / each / BATCHES)), each)
 
 
+# Exact averages over pixels, one a pass, moved up, down, left and right by what float32 may round.
+AVERAGED = Plan(4, 1)
+
+
 def exact_plan(camera: Camera, index: int, sampler: Sampler, *, fast: bool = True) -> Plan | None:
     """Return the passes that show a flat target to sub-imager `index` without error; None if none do.
 
     fast : True if the averages of the picture over its pixels can be had, one a pass
     """
     sub = camera.sub_imagers[index]
-    if sampler not in JITTERED:
+    ratio = sub.type.ratio
+    if sampler not in JITTERED or not sub.type.optics.is_pinhole:
         return None
-    if has_grid(camera, index):
-        return Plan(EXACT_PASSES, sub.type.ratio.numerator**2)
-    averaged = fast and sub.type.optics.is_pinhole and has_equal_boxes(camera, sub.type)
-    return Plan(AVERAGED_PASSES, 1) if averaged else None
-
-
-def has_grid(camera: Camera, index: int) -> bool:
-    """Return True if a grid of samples fits the edges of the pixels of f that sub-imager `index` sees."""
-    sub = camera.sub_imagers[index]
-    ends = [float(start * sub.type.ratio.denominator) for start in sub.window]
-    fits = sub.type.ratio.numerator <= MOST_CELLS and all(end.is_integer() for end in ends)
-    is_ideal = camera.walls and camera.tolerance is None and sub.type.optics.is_pinhole and not sub.rotation
-    return fits and is_ideal and margin(camera, sub.type) <= WIDEST_MARGIN
+    ends = [float(start * ratio.denominator) for start in sub.window]
+    fits = ratio.numerator <= MOST_CELLS and all(end.is_integer() for end in ends)
+    is_ideal = camera.walls and camera.tolerance is None and not sub.rotation
+    if fits and is_ideal and margin(camera, sub.type) <= WIDEST_MARGIN:
+        return Plan(EXACT_PASSES, ratio.numerator**2)
+    return AVERAGED if fast and has_equal_boxes(camera, sub.type) else None
 
 
 def has_equal_boxes(camera: Camera, lens_type: LensType) -> bool:

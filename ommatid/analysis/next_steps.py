@@ -51,6 +51,7 @@ class NextStep:
 CHANGES = (
     ("noise", "half the noise variance", "twice the light, or the mean of two frames", 0.5),
     ("quantisation", HALF_STEP, HALF_STEP_HOW, 0.25),
+    ("frames", "twice the dark and flat frames", "`sensor.frames`", 0.5),
     ("misalignment", "positions of the lenses calibrated", "`ommatid calibrate`, then `estimator.misalignment`", 0.0),
 )
 SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples`"}

@@ -46,6 +46,7 @@ CERTAIN = (
 )  # noise that stays known when the rest of it is to be fitted
 ROUNDS = 6
 UNCHANGED = 0.05  # standard deviations of its noise: change of the light expected on a saturated pixel
+BEFORE_ROUNDING = ("noise", "rendering")  # by cause
 DITHER = 0.4  # noise over the quantisation step from which rounding errors are independent of the signal
 HARMONICS = 20  # of the mean error of rounding; those beyond are 3 % of its variance without noise
 LEAST_INFORMATION = 0.01  # of an unsaturated pixel: a saturated one with less is left out
@@ -260,10 +261,10 @@ def common_rounding(noise: Noise, light: FloatArray) -> FloatArray:
     noise : by cause, (measurements used,) each;  light : (measurements used,) that the estimate predicts
     """
     step = np.sqrt(12 * noise["quantisation"])
-    others = total_variance({name: values for name, values in noise.items() if name != "quantisation"})
+    before = total_variance({name: noise[name] for name in BEFORE_ROUNDING if name in noise}) / step**2
     squares = np.zeros(light.size)
     for order in np.pi * np.arange(1, HARMONICS + 1):
-        squares += np.exp(-4 * order**2 * others / step**2) / (2 * order**2)
+        squares += np.exp(-4 * order**2 * before) / (2 * order**2)
     phase = 2 * np.pi * light / step
     return step * np.sqrt(squares) * np.stack([np.cos(phase), np.sin(phase)])
 

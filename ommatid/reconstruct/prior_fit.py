@@ -9,9 +9,9 @@ with an unknown level of deviation L, the density
 
     g - H f0 ~ N(0, C),   C = H P(c, l, a) H^T + L^2 H 1 1^T H^T + t Rv,
 
-t = 1 where the noise is known; Rv holds, too, what wide point spreads see beside the window, by one rank. H P H^T,
-diagonalised once for each l and a, gives the evidence for every c and t; the windows count as independent (Stein, Chi
-and Welty 2004). Few measurements and much noise leave the numbers open, above all how much the image holds at
+t = 1 where the noise is known; Rv holds, too, what wide point spreads see beside the window, by one rank. The variance of
+a pixel, c, has before the stack the density that windows of natural pictures have. H P H^T, diagonalised once for each
+l and a, gives the evidence for every c and t; the windows count as independent (Stein, Chi and Welty 2004). Few measurements and much noise leave the numbers open, above all how much the image holds at
 frequencies that no lens sees. So the prior is the mean of these spectra, weighted by their evidence: its covariance is
 that of images whose numbers are drawn from the posterior, and Eq. 5 holds on average over them. The exponents and
 lengths lie on a grid; c, and t where the noise is fitted, on one that is refined where the evidence is.
@@ -44,6 +44,7 @@ WHOLE = 22  # pixels of f, side of the largest image that is one window, and
 WHOLE_WIDE = 32  # of one in front of wide footprints
 WIDEST = 24  # pixels of f, side of the widest window of larger ones
 NATURAL_EXPONENT, NATURAL_LENGTH = 2.0, 10.0  # of a picture that is not known; pixels of f
+SMOOTH, ROUGH = 10.0, 74.0  # grey levels, deviations of a window's pixels outside of which they are rarer
 PER_AXIS = 3  # windows along an axis
 MOST = 400  # measurements of a window of more pixels
 LEAST = 10  # measurements, for three numbers
@@ -279,11 +280,15 @@ class ScalePosterior(NamedTuple):
     moments: FloatArray
 
     @classmethod
-    def of(cls, evidence: list[Evidence], ranges: tuple[FloatArray, FloatArray]) -> ScalePosterior:
+    def of(
+        cls, evidence: list[Evidence], ranges: tuple[FloatArray, FloatArray], *, prior_known: bool
+    ) -> ScalePosterior:
         """Integrate over grids of the logarithms, which are refined where the evidence is."""
 
         def scores() -> FloatArray:
-            return np.sum([part.log(np.exp(grids[0]), np.exp(grids[1])) for part in evidence], axis=0)
+            scales, noises = np.exp(grids[0]), np.exp(grids[1])
+            before = np.zeros(scales.size) if prior_known else _contrasts(scales)
+            return np.sum([part.log(scales, noises) for part in evidence], axis=0) + before[:, None]
 
         grids, found, at_end = list(ranges), np.zeros((1, 1)), False
         for number in range(REFINEMENTS + 1):
@@ -301,6 +306,11 @@ class ScalePosterior(NamedTuple):
         moments = [[share @ grid, share @ grid**2] for share, grid in zip(shares, grids, strict=True)]
         best = float(found.max())
         return cls(best + log(weights.sum() * cell), best, at_end, (means[0], means[1]), np.array(moments))
+
+
+def _contrasts(variances: FloatArray) -> FloatArray:
+    """Return the log density of a window's log variance in natural pictures."""
+    return -np.log1p(SMOOTH / np.sqrt(variances)) - 2 * np.log1p(variances / ROUGH**2)
 
 
 def _refined(grid: FloatArray, near: BoolArray) -> FloatArray:
@@ -409,7 +419,7 @@ def _posteriors(
     for evidence in every:
         seen = float(np.mean(np.concatenate([part.values for part in evidence])))
         scales = fixed if prior_known else log(square / seen) + np.arange(-REACH, REACH, COARSE)
-        posteriors.append(ScalePosterior.of(evidence, (scales, noises)))
+        posteriors.append(ScalePosterior.of(evidence, (scales, noises), prior_known=prior_known))
     masses = [log(spectrum.weight) + each.mass for spectrum, each in zip(spectra, posteriors, strict=True)]
     shares = np.exp(np.array(masses) - max(masses))
     best = posteriors[int(np.argmax(shares))]

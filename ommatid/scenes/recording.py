@@ -58,8 +58,8 @@ class Recording:
     def noise(self, values: FloatArray) -> dict[str, FloatArray]:
         """Variances of the pixels' values, in squared units of f, under light of `values`, clipped at 0.
 
-        noise : shot noise, read noise, and the noise of the finite numbers of dark and flat frames
-        quantisation : rounding of the exposure
+        noise : shot noise and read noise;  quantisation : rounding of the exposure
+        frames : noise and rounding of the finite numbers of dark and flat frames, the same in every exposure
         A value is V (g - d) / (F - d) of a reading g, the dark d and the flat F at V, so that the flat contributes
         (value / V)^2 and the dark (1 - value / V)^2 of its variance.
         """
@@ -69,7 +69,8 @@ class Recording:
             0 * light
         )
         reading = self._reading_variance(self.slope * light)
-        return {"noise": (reading + frames) / self.slope**2, "quantisation": ROUNDING / self.slope**2}
+        variances = {"noise": reading, "quantisation": ROUNDING, "frames": frames}
+        return {name: variance / self.slope**2 for name, variance in variances.items()}
 
     def noise_variance(self, values: FloatArray) -> FloatArray:
         """The sum of the variances of `noise`."""

@@ -16,6 +16,7 @@ HALF_STEP_HOW = "one more of `noise.bits`, or `sensor.gain` doubled with one mor
 CHANGES = {
     "noise": ("half the noise variance", 0.5),
     "quantisation": (f"{HALF_STEP} ({HALF_STEP_HOW})", 0.25),
+    "frames": ("twice the dark and flat frames", 0.5),
     "misalignment": ("a camera without misalignment", 0.0),
 }
 SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples`"}
@@ -78,6 +79,7 @@ def cause(name: str) -> str:
     words = {
         "null_space": "null space of H",
         "noise": "sensor noise",
+        "frames": "dark and flat frames",
         "rendering": "noise of the rendering",
         "detail": "detail finer than f",
         "calibration": "uncertainty of H",

@@ -257,9 +257,9 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
             " noise alone explains the measurements"
         )
     if check.fit_flat:
-        findings.doubts.append(
-            "noise alone explains the measurements, so that the fitted prior takes the picture for grey: if it has"
-            " detail that no lens shows, the error bars do not hold it; compare with prior.kind = 'independent'"
+        findings.notes.append(
+            "noise alone explains the measurements: the image is about grey, and its error bars hold the contrast that"
+            " such noise hides in natural pictures on average"
         )
     if check.left_out:
         findings.notes.append(

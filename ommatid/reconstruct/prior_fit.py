@@ -9,12 +9,13 @@ with an unknown level of deviation L, the density
 
     g - H f0 ~ N(0, C),   C = H P(c, l, a) H^T + L^2 H 1 1^T H^T + t Rv,
 
-t = 1 where the noise is known; Rv holds, too, what wide point spreads see beside the window, by one rank. The variance of
-a pixel, c, has before the stack the density that windows of natural pictures have. H P H^T, diagonalised once for each
-l and a, gives the evidence for every c and t; the windows count as independent (Stein, Chi and Welty 2004). Few measurements and much noise leave the numbers open, above all how much the image holds at
-frequencies that no lens sees. So the prior is the mean of these spectra, weighted by their evidence: its covariance is
-that of images whose numbers are drawn from the posterior, and Eq. 5 holds on average over them. The exponents and
-lengths lie on a grid; c, and t where the noise is fitted, on one that is refined where the evidence is.
+t = 1 where the noise is known; Rv holds, too, what wide point spreads see beside the window, by one rank. The variance
+of a pixel, c, has before the stack the density that windows of natural pictures have. H P H^T, diagonalised once for
+each l and a, gives the evidence for every c and t; the windows count as independent (Stein, Chi and Welty 2004). Few
+measurements and much noise leave the numbers open, above all how much the image holds at frequencies that no lens sees.
+So the prior is the mean of these spectra, weighted by their evidence: its covariance is that of images whose numbers
+are drawn from the posterior, and Eq. 5 holds on average over them. The exponents and lengths lie on a grid; c, and t
+where the noise is fitted, on one that is refined where the evidence is.
 """
 
 from __future__ import annotations

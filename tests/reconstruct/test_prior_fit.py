@@ -251,7 +251,7 @@ def test_few_correlated_pixels_behind_dead_ones_are_a_dense_problem() -> None:
 
 
 def test_error_bars_hold_the_detail_that_noise_hides() -> None:
-    """Crops of a photograph in much noise: those that it hides are hardly more wrong than stated, and a note says so."""
+    """Crops of a photograph that much noise hides are hardly more wrong than stated, and a note says so."""
     described = wide(SHAPE, noise={"variance": 1000.0}, prior={"kind": "fit"})
     rng, photograph = np.random.default_rng(0), data.camera()
     hidden: list[float] = []

@@ -406,7 +406,8 @@ class _Search:
         noise, squares, seen = self.task.expected_noise, self.squares(np.zeros(self.m.size)), self.expected > SEEN
         scene, step, expected = self.stack.scene, _step(self.readings), self.expected[seen]
         added = step**2 / 12 - (0.0 if scene.noise is None else scene.noise.quantisation_variance)
-        if step and (expected * added / noise[seen]).sum() > EXPLAINED * (squares[seen] - expected).sum():
+        excess = (squares[seen] - expected).sum()
+        if added > step**2 / 24 and (expected * added / noise[seen]).sum() > EXPLAINED * excess:
             return "bits", [step, float(np.log2(FULL_SCALE / step)), added]
         slopes = self._effects(self.method.image)["shift"]
         found = {

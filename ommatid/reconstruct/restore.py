@@ -63,6 +63,7 @@ def verdict_of(
     check = ErrorCheck(
         mse=None if error is None else error.mse,
         interval=result.interval,
+        predicted=expected.mse,
         variance_bound=result.solver.variance_bound,
         spurious=_spurious(spurious, expected) if total else 0.0,
         spurious_share=float(spurious.mean()),

@@ -28,6 +28,7 @@ SIZE = 0.1  # relative deviation from which a number is wrong
 ROUGH = 0.05  # relative error of a map of variances from which it is a doubt
 STRIKING = 1.5  # ratio to the whole from which a region is worth naming
 UNCERTAIN = ": the uncertainty of H is more than a small correction; "
+APART = 1.5  # ratio of the RMS error to expect for a picture to the stated one, from which its error bars are doubtful
 SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 
@@ -42,7 +43,7 @@ def without_pixels(camera: Camera, used: BoolArray) -> tuple[str, ...]:
 class ErrorCheck:
     """Numbers of the other checks.
 
-    mse, interval : measured and expected error of the image, None if not known
+    mse, interval : measured and expected error of the image, None if not known;  predicted : averaged over the prior
     variance_bound : on the relative error of variances
     spurious : relative error of Eq. 5 by the noise of H beyond what it counts
     spurious_share : of a pixel's information, on average
@@ -55,6 +56,7 @@ class ErrorCheck:
 
     mse: float | None
     interval: Interval | None
+    predicted: float
     variance_bound: float
     spurious: float
     spurious_share: float
@@ -197,6 +199,12 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
             findings.passed.append(words.format("inside"))
         else:
             findings.passed.append(words.format("outside") + ", but not by more than chance and a tenth")
+        if interval.mse > APART**2 * check.predicted:
+            findings.doubts.append(
+                f"an error of {interval.mse**0.5:.3g} grey levels RMS is expected for this picture, and"
+                f" {check.predicted**0.5:.3g} on average over the prior's images: it has detail that no lens shows and"
+                " the prior does not expect, so that the error bars do not hold"
+            )
     if check.variance_bound > SIZE:
         findings.reasons.append(
             f"the variances of some pixels are wrong by {100 * check.variance_bound:.2g} % or more: the solver's map of"
@@ -257,7 +265,7 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
             " noise alone explains the measurements"
         )
     if check.fit_flat:
-        findings.notes.append(
+        (findings.doubts if check.interval is None else findings.notes).append(
             "noise alone explains the measurements: the image is about grey, and its error bars hold the contrast that"
             " such noise hides in natural pictures on average"
         )

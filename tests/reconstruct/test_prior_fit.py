@@ -266,6 +266,25 @@ def test_error_bars_hold_the_detail_that_noise_hides() -> None:
     assert max(hidden) < 1.5
 
 
+def test_a_picture_that_noise_hides_is_doubtful_where_the_truth_is_not_known() -> None:
+    described = wide(SHAPE, noise={"variance": 1.0}, prior={"kind": "fit"})
+    result = restore(recorded(described, np.full(361, 200.0), 1.0), MODEL)
+    assert result.verdict.level == "amber"
+    assert "noise alone explains the measurements" in " ".join(result.verdict.doubts)
+
+
+@pytest.mark.parametrize("contrast", [0.0, 2.0])
+def test_detail_that_the_lens_averages_out_is_doubtful(contrast: float) -> None:
+    """Stripes of three pixels behind boxes of three, beside a ramp; the same ramp alone is trusted."""
+    lenses = FITTED[:1]
+    described = wide(SHAPE, lenses, noise={"variance": 1.0}, prior={"kind": "fit"})
+    row, column = np.indices(SHAPE)
+    image = (100.0 + 4 * row + 20 * contrast * np.cos(2 * np.pi * column / 3)).ravel()
+    result = restore(recorded(described, image, 1.0), model_of(SHAPE, lenses), image)
+    doubts = " ".join(result.verdict.doubts)
+    assert ("detail that no lens shows" in doubts) == (contrast > 0)
+
+
 @pytest.mark.parametrize(("picture", "said"), [(True, "fitted to the scene's picture"), (False, "1/frequency^2")])
 def test_a_prediction_fits_the_prior_to_the_picture(picture: bool, said: str) -> None:
     """Its error is that of the stack's own fit within a third; without a picture it says what it takes."""

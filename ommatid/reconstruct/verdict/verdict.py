@@ -203,7 +203,7 @@ def _judge_error(check: ErrorCheck, findings: _Findings) -> None:
             findings.doubts.append(
                 f"an error of {interval.mse**0.5:.3g} grey levels RMS is expected for this picture, and"
                 f" {check.predicted**0.5:.3g} on average over the prior's images: it has detail that no lens shows and"
-                " the prior does not expect, so that the error bars do not hold"
+                " the prior does not expect, so that its error bars are too small"
             )
     if check.variance_bound > SIZE:
         findings.reasons.append(

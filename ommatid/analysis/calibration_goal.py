@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ommatid.reconstruct.detail.detailed_model import model_of_f
+from ommatid.reconstruct.coarse_model import model_of_f
 from ommatid.reconstruct.expected_error import ExpectedError
 from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution, total_variance

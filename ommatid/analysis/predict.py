@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from ommatid.reconstruct.detail.detailed_model import model_of_f
+from ommatid.reconstruct.coarse_model import model_of_f
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.misalignment.moments import misalignment_variance
 from ommatid.reconstruct.prediction import Prediction, predict, predict_frame

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ommatid.reconstruct.assumptions import Assumptions, assumptions_for, with_fallback
-from ommatid.reconstruct.detail.detailed_model import DetailedModel, model_of_f
+from ommatid.reconstruct.coarse_model import model_of_f
 from ommatid.reconstruct.method_choice import METHODS, MethodChoice
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import Execution, MethodResult
@@ -135,7 +135,7 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
 
 
 def _dense(outcome: _Outcome) -> bool:
-    return outcome.choice.method in ("dense", "detail")
+    return outcome.choice.method == "dense"
 
 
 def _mismatch(setup: Setup, recording: PredictedRecording, outcome: _Outcome) -> _Mismatch | None:
@@ -173,16 +173,13 @@ def _mismatch_of_images(recording: PredictedRecording, outcome: _Outcome, cause:
     """
     if recording.true is None:
         raise ValueError("expected a camera whose H differs from the estimator's, got one that it knows")
-    task = outcome.assumed.method.task
-    world, offset = recording.image, task.model.offset if isinstance(task.model, DetailedModel) else 0.0
+    task, world = outcome.assumed.method.task, recording.image
     image = averaged(world.reshape(recording.model.camera.shape), task.model.camera.detail).ravel()
     if recording.model.camera.shape == task.model.camera.shape:
         image = world
     readings = {"true": recording.true @ world, "designed": recording.model.forward(world)}
     errors = {
-        name: np.square(
-            METHODS[outcome.choice.method](replace(task, recorded=values - offset), Execution()).image - image
-        )
+        name: np.square(METHODS[outcome.choice.method](replace(task, recorded=values), Execution()).image - image)
         for name, values in readings.items()
     }
     added = errors["true"] - errors["designed"]

@@ -15,7 +15,6 @@ from ommatid.scenes.setup import Setup
 
 METHODS = {
     "dense": "one dense problem",
-    "detail": "all pixels at once, with the covariance of detail finer than f",
     "fit": "one dense problem, H fitted to the stack",
     "tiles": "tile by tile",
     "frame": "the whole frame at once",

@@ -16,7 +16,7 @@ from ommatid.analysis import held_out
 from ommatid.analysis.averaging_kernel import ErrorWindow, error_window
 from ommatid.analysis.next_steps import best_other_type, next_steps
 from ommatid.bench.table import BenchTable
-from ommatid.reconstruct.detail.detailed_model import model_of_f
+from ommatid.reconstruct.coarse_model import model_of_f
 from ommatid.reconstruct.output import verdict_words
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera

@@ -20,7 +20,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .detail.detailed_model import DetailedModel, model_of_f
+from .coarse_model import CoarseModel, model_of_f
 from .frame.conjugate_gradients import NotReachedError
 from .method_choice import METHODS, MethodChoice, choose_method
 from .methods.method import Execution, Method, MethodResult, total_variance
@@ -202,12 +202,10 @@ def _assumptions(
         return METHODS[choice.method](observation.task(observation.expected_noise(noise), shared), execution)
 
     def preliminary(observation: ObservedStack, noise: Noise) -> Method:
-        """Return a method for a first image, by the variances of detail alone where H on f's grid has entries."""
-        entries = isinstance(observation.model, DetailedModel) and observation.model.coarse is None
-        if not entries or choice.method not in ("detail", "frame"):
-            return method_with(observation, noise)
-        expected = observation.expected_noise(noise) + observation.detail_variance
-        return METHODS["dense"](observation.task(expected), execution)
+        """Return a method for a first image, a dense one where H on f's grid has entries."""
+        if isinstance(observation.model, CoarseModel) and observation.model.stored is not None:
+            return METHODS["dense"](observation.task(observation.expected_noise(noise)), execution)
+        return method_with(observation, noise)
 
     observation, noise, method, image = first, first.noise(), None, None
     if depends_on_light(stack, model) or SHARED in noise:
@@ -224,7 +222,7 @@ def _assumptions(
     if fit is not None:
         observation, noise = _with_fit(first, model, noise, fit)
     fixed = observation.expects_fixed_noise
-    if method is None or fit is not None or not fixed or choice.method == "detail":
+    if method is None or fit is not None or not fixed:
         method = method_with(observation, noise, image)
     contrast = _true_contrast(method, noise)
     if contrast is not None:

@@ -22,7 +22,7 @@ from ommatid.runtime.errors import InputError
 
 from .estimator.certificate import exact_sums, refine
 from .estimator.residuals import ExactResiduals, exact
-from .problem import Form, Whitening
+from .problem import Form
 
 Pixels = NDArray[np.intp]
 
@@ -156,29 +156,10 @@ class Interval:
         return interval(max(count * self.mse + mean, 0.0), count**2 * self.variance + variance, count)
 
 
-@dataclass(frozen=True)
-class CorrelatedNoise:
-    """Noise of a form's problem that is correlated between measurements, so that they were whitened.
-
-    cause : to which the error is put down that measurements bring beyond their independent noise
-    excess : (M,) by which the independent part of what was whitened exceeds the actual noise
-    """
-
-    white: Whitening
-    cause: str
-    excess: FloatArray
-
-
-def expected_error(
-    form: Form,
-    noise: dict[str, FloatArray],
-    pixels: Pixels | None = None,
-    correlated: CorrelatedNoise | None = None,
-) -> ExpectedError:
+def expected_error(form: Form, noise: dict[str, FloatArray], pixels: Pixels | None = None) -> ExpectedError:
     """Return Eq. 5 for the actual noise.
 
     noise : named (M,) variances, the diagonal of Rvm in parts;  pixels : whose error is returned, absent: all
-    correlated : what the problem of the form was whitened by; None if its noise is independent
     """
     problem = form.problem
     pixels = np.arange(problem.unknowns) if pixels is None else pixels
@@ -192,17 +173,12 @@ def expected_error(
         products = by_column[:, chosen].multiply(negative)
         resolved[chunk] = -np.asarray(products.sum(axis=0)).ravel()
         leverage -= np.asarray(products.sum(axis=1)).ravel()
-        squared = np.square(negative if correlated is None else correlated.white.multipliers(negative))
-        if correlated is None:
-            noisy[chunk] = total @ squared
-        else:
-            noisy[chunk] = np.square(negative).sum(axis=0) - correlated.excess @ squared
+        squared = np.square(negative)
+        noisy[chunk] = total @ squared
         weights += squared.sum(axis=1) / count
-    as_expected = correlated is None and np.array_equal(total, problem.noise_variance)
+    as_expected = np.array_equal(total, problem.noise_variance)
     variance = form.variance()[pixels] if as_expected else missing + noisy
     parts = {name: float(weights @ values) for name, values in noise.items()}
-    if correlated is not None:
-        parts[correlated.cause] = max(float(noisy.mean()) - sum(parts.values()), 0.0)
     all_pixels = count == problem.unknowns
     return ExpectedError(variance, float(missing.mean()), parts, resolved, leverage if all_pixels else None)
 
@@ -218,21 +194,20 @@ def expected_given(form: Form, truth: FloatArray, noise_variance: FloatArray) ->
 
 
 def squared_error(
-    form: Form, bias: FloatArray, noise_variance: FloatArray, pixels: Pixels, white: Whitening | None = None
+    form: Form, bias: FloatArray, noise_variance: FloatArray, pixels: Pixels
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean and variance of the sum of squared errors of some pixels, (t,) each, for the biases of t images.
 
     With K = A Rvm A^T of these pixels, the quadratic form |b|^2 + trace(K) has the variance 4 b^T K b + 2 trace(K^2).
 
-    bias : (pixels, t) (I - A H)(f - f0);  noise_variance : (M,) of the measurements before they were whitened
+    bias : (pixels, t) (I - A H)(f - f0);  noise_variance : (M,)
     """
     trace = squares = 0.0
     along = np.zeros(bias.shape[1])
     for chunk, _, _, negative in solved_columns(form, pixels):
-        gain = negative if white is None else white.multipliers(negative)
-        weighted = noise_variance[:, None] * gain
-        covariance = -form.gain(weighted if white is None else white.vector(weighted))[pixels]
-        trace += float(np.sum(weighted * gain))
+        weighted = noise_variance[:, None] * negative
+        covariance = -form.gain(weighted)[pixels]
+        trace += float(np.sum(weighted * negative))
         squares += float(np.square(covariance).sum())
         along += np.sum((covariance.T @ bias) * bias[chunk], axis=0)
     return np.square(bias).sum(axis=0) + trace, 4 * along + 2 * squares

@@ -11,7 +11,6 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene
 
-from .detail.detailed_model import DetailMethod, detail_memory, has_moments
 from .estimator.estimate import needed_memory
 from .frame.conjugate_gradients import band_width, band_work, leaves_null_space, serves
 from .frame.frame_method import FrameMethod
@@ -30,7 +29,6 @@ TILE_ACCURACY = 0.3  # posterior standard deviations from the exact answer, on a
 
 METHODS: dict[str, type[Method]] = {
     "dense": DenseMethod,
-    "detail": DetailMethod,
     "fit": AlignedMethod,
     "tiles": TileMethod,
     "frame": FrameMethod,
@@ -57,7 +55,7 @@ def choose_method(scene: Scene, camera: Camera, exact: bool) -> MethodChoice:
     if scene.estimator.misalignment != "trust":
         return _misaligned(scene, camera, exact, allowed)
     of_world = _of_world(scene, camera)
-    if camera.has_detail and (of_world is None or has_moments(camera)):  # the model of f has no boxes
+    if camera.has_detail and of_world is None:  # the model of f has no boxes
         exact = exact and camera.unknowns > MOST_DENSE and not camera.has_box_footprints
     names, why = of_world or _candidates(scene, camera, exact)
     memory = {name: _memory(name, scene, camera, exact) for name in names}
@@ -76,8 +74,6 @@ def _of_world(scene: Scene, camera: Camera) -> tuple[list[str], str] | None:
     """Return the method for a world finer than f of which the prior says something, and why; None without one."""
     if not camera.has_detail or scene.prior.kind == "independent":
         return None
-    if has_moments(camera):
-        return ["detail"], "the world is finer than f, and the moments of its detail are matrices"
     if scene.estimator.method not in ("auto", "frame"):
         raise InputError(
             f"{scene.source}: estimator.method '{scene.estimator.method}' does not serve {camera.unknowns} pixels in"
@@ -157,9 +153,8 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
     """Return an upper estimate of the bytes that a method needs."""
     widest, correlated = max(ceil(lens_type.ratio) for lens_type in camera.types), scene.prior.kind != "independent"
     entries = 0 if exact else 12 * 10 * camera.measurements * widest**2
-    if method in ("dense", "detail"):
-        needed = needed_memory(camera.measurements, camera.unknowns, correlated=correlated) + entries
-        return needed + (detail_memory(camera) if method == "detail" else 0)
+    if method == "dense":
+        return needed_memory(camera.measurements, camera.unknowns, correlated=correlated) + entries
     images = 8 * (5 * camera.measurements + 16 * camera.unknowns)
     if method == "tiles":
         side = scene.tiles.size**2
@@ -177,7 +172,7 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
 def _seconds(method: str, scene: Scene, camera: Camera, exact: bool) -> float:
     """Return the time that a method takes on two cores, measured to within a factor of two or so."""
     count, correlated = camera.unknowns, scene.prior.kind != "independent"
-    if method in ("dense", "detail"):
+    if method == "dense":
         return max(0.1, 7e-11 * count**3 * (10 if correlated else 1))
     per_pixel = 0.15 * (scene.tiles.size / 35) ** 6 / (scene.tiles.size - 2 * scene.tiles.overlap) ** 2
     if method == "tiles":

@@ -28,7 +28,7 @@ from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .detail.detailed_model import DetailedModel, model_of_f
+from .coarse_model import model_of_f
 from .methods.method import EstimationTask, is_uniform, total_variance
 from .prior import coloured, spectrum_of
 from .prior_fit import PriorFit
@@ -180,11 +180,6 @@ class ObservedStack:
         spectrum = spectrum_of(self.prior, camera.shape, camera.target_pitch, camera.detail)
         return self.prior.mean + coloured(spectrum, probe(Purpose.SHARED_PRIOR).normal(size=camera.shape)).ravel()
 
-    @property
-    def detail_variance(self) -> FloatArray | float:
-        """Variance of detail on the pixels used, (pixels used,)."""
-        return self.model.detail_variance[self.usable.used] if isinstance(self.model, DetailedModel) else 0.0
-
     def expected_noise(self, noise: Noise) -> FloatArray:
         """Return the variance that the estimator assumes, (pixels used,)."""
         setting = self.stack.scene.estimator.noise_variance
@@ -198,16 +193,14 @@ class ObservedStack:
         return isinstance(self.stack.scene.estimator.noise_variance, float)
 
     def task(self, expected_noise: FloatArray, shared_image: FloatArray | None = None) -> EstimationTask:
-        """Return the task of an estimation method; the offset of detail's mean is taken off the measurements.
+        """Return the task of an estimation method.
 
         shared_image : (N,) whose errors by few numbers of H are part of the expected noise; None: they are not
         """
-        scene, model, recorded = self.stack.scene, self.model, self.stack.values
-        if isinstance(model, DetailedModel):
-            recorded = recorded - model.offset
+        scene, model = self.stack.scene, self.model
         return EstimationTask(
             model,
-            recorded,
+            self.stack.values,
             self.usable.used,
             expected_noise,
             self.prior,

@@ -202,7 +202,7 @@ def predict_frame(choice: MethodChoice, model: Model, camera: Camera, actual: fl
         finer=model.camera.rows // camera.rows,
     )
     result = METHODS[choice.method](task, Execution()).result({"noise": noise}, None)
-    seen = observability(model.matrix[used]) if choice.method in ("dense", "detail") else None
+    seen = observability(model.matrix[used]) if choice.method == "dense" else None
     return Prediction.of(
         result.expected.variance,
         result.expected,

@@ -34,7 +34,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .detail.detailed_model import DetailedModel
+from .coarse_model import CoarseModel
 from .methods.method import EstimationTask
 from .prior import FittedPrior, SpectralTerm, natural_spectrum, spectrum_of
 
@@ -167,7 +167,7 @@ class Place:
 
         That is an average over many pixels, about the same for all of them, by as much as they lose of the light.
         """
-        fine, _ = _unknowns(task)
+        fine = _unknowns(task)
         matrix = np.asarray(fine.windowed.rows_on(self.numbers, self.rows, self.columns).toarray())
         deviation = np.sqrt(noise[task.among_used(self.numbers)])
         beside = (self.light - matrix.sum(axis=1)) * float(np.mean(self.residual**2)) ** 0.5 / deviation
@@ -197,17 +197,17 @@ class _Picture:
         return Evidence(spectrum.ravel() / ROUNDING, residual / ROUNDING**0.5, light / ROUNDING**0.5, (0, 0, 0, 0))
 
 
-def _unknowns(task: EstimationTask) -> tuple[Model, FloatArray | float]:
-    """Return the model of the pixels that have the prior, of f or of a finer world, and what the data lack of it."""
-    return (task.model.fine, task.model.offset) if isinstance(task.model, DetailedModel) else (task.model, 0.0)
+def _unknowns(task: EstimationTask) -> Model:
+    """Return the model of the pixels that have the prior, of f or of a finer world."""
+    return task.model.fine if isinstance(task.model, CoarseModel) else task.model
 
 
 def places_of(task: EstimationTask) -> list[Place]:
     """Return the windows whose measurements count: the whole of a small image, else up to nine over it."""
-    (fine, offset), detail = _unknowns(task), _detail(task)
+    fine, detail = _unknowns(task), _detail(task)
     side = max(WINDOW, 2 * -(-fine.windowed.reach // detail))
     light = fine.forward(np.ones(fine.unknowns))
-    residual = task.recorded + offset - task.prior.mean * light
+    residual = task.recorded - task.prior.mean * light
     found: list[Place] = []
     for rows, columns in product(*(_spread(size, side, detail) for size in task.shape)):
         numbers = _numbers(task, fine, rows, columns)
@@ -241,7 +241,7 @@ def _numbers(task: EstimationTask, fine: Model, rows: slice, columns: slice) -> 
 
 def _detail(task: EstimationTask) -> int:
     """Return how many times finer than f the unknowns are."""
-    return _unknowns(task)[0].camera.rows // task.shape[0]
+    return _unknowns(task).camera.rows // task.shape[0]
 
 
 def _spectra(shape: tuple[int, int], pitch: float, detail: int) -> list[_Spectrum]:

@@ -20,7 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse
+from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -119,37 +119,6 @@ class Problem:
     def _factor(self) -> sparse.csr_array | FloatArray:
         """H as products take it: with its zeros where they are few."""
         return self.matrix.toarray() if is_dense(self.matrix) else self.matrix
-
-
-@dataclass(frozen=True)
-class Whitening:
-    """The Cholesky factor K of an Rv with covariances, (M, M); K^-1 g has unit noise."""
-
-    factor: FloatArray
-
-    @classmethod
-    def of(cls, covariance: FloatArray, noise_variance: FloatArray, refusal: str) -> Whitening:
-        """Factorise a covariance, (M, M), with the independent noise of the measurements, (M,).
-
-        Raises InputError with the words of `refusal` where noise is missing, so that the sum is singular.
-        """
-        try:
-            return cls(np.asarray(linalg.cholesky(covariance + np.diag(noise_variance), lower=True)))
-        except linalg.LinAlgError:
-            raise InputError(refusal) from None
-
-    def vector(self, recorded: FloatArray) -> FloatArray:
-        """Return K^-1 g: (M,) or (M, q)."""
-        return np.asarray(linalg.solve_triangular(self.factor, recorded, lower=True, check_finite=False))
-
-    def multipliers(self, white: FloatArray) -> FloatArray:
-        """Return K^-T l, (M,) or (M, q): multipliers of the problem from those of the whitened one."""
-        solved = linalg.solve_triangular(self.factor, white, trans="T", lower=True, check_finite=False)
-        return np.asarray(solved)
-
-    def problem(self, matrix: sparse.csr_array, prior: Prior) -> Problem:
-        """Return the whitened problem, K^-1 H with unit noise, for measurements K^-1 g."""
-        return Problem(sparse.csr_array(self.vector(matrix.toarray())), prior, np.ones(matrix.shape[0]))
 
 
 class NotSolvableError(Exception):

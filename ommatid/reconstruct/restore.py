@@ -22,8 +22,7 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .assumptions import Assumptions, assumptions_for, with_fallback
-from .detail.detailed_model import CAUSE as DETAIL
-from .detail.detailed_model import DetailedModel, DetailMethod
+from .coarse_model import CAUSE as DETAIL
 from .expected_error import ExpectedError, Interval
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
@@ -295,8 +294,7 @@ def _restored(
 
 def truth_for(method: Method, truth: FloatArray | None, camera: Camera) -> FloatArray | None:
     """Return what a method compares its estimate with: the world where it takes detail into account, else f."""
-    knows_world = isinstance(method, DetailMethod) or method.task.finer > 1
-    return truth if truth is None or knows_world else _image(truth, camera)
+    return truth if truth is None or method.task.finer > 1 else _image(truth, camera)
 
 
 def _image(truth: FloatArray, camera: Camera) -> FloatArray:
@@ -318,7 +316,7 @@ def _given_estimate(method: Method, expected: ExpectedError) -> float | None:
         bias = method.task.of_f(operators.hidden(method.image - method.mean))
     except InputError:  # those of tiles are conjugate gradients, which not every frame allows
         return None
-    noisy = sum(part for cause, part in expected.parts.items() if cause != DETAIL or method.task.finer == 1)
+    noisy = sum(part for cause, part in expected.parts.items() if cause != DETAIL)
     return float(np.square(bias).mean()) + noisy
 
 
@@ -329,8 +327,6 @@ def _spurious_information(task: EstimationTask, expected: ExpectedError) -> Floa
         return np.zeros(count)
     noise = np.full(model.measurements, np.inf)
     noise[task.used] = task.expected_noise
-    if isinstance(model, DetailedModel) and model.detail_covariance is not None:
-        noise += model.detail_variance
     with np.errstate(divide="ignore", invalid="ignore"):  # without noise and without uncertainty of H
         information = task.finer**2 * task.of_f(model.spurious_information(noise))
         return np.nan_to_num(information * expected.variance)

@@ -62,10 +62,8 @@ class Purpose(IntEnum):
     ATTENUATION = 62
     SHARED_ERRORS = 63  # of few numbers of H
     SHARED_PRODUCTS = 64
-    SHARED_INDEPENDENT = 65
     SHARED_PRIOR = 66
     DETAIL = 67
-    DETAIL_SCATTER = 68
     KERNEL_ERRORS = 70
     GOAL = 71  # of a calibration
     GOAL_BOUND = 72

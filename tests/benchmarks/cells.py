@@ -1,6 +1,6 @@
 """Every combination of camera, size, prior, detail, noise and number of lens types.
 
-`python -m tests.benchmarks cells` prints what `run --dry-run` says of these 4,860 cells, in ten minutes: the table of
+`python -m tests.benchmarks cells` prints what `run --dry-run` says of these 4,860 cells, in some minutes: the table of
 docs/frames.md.
 """
 

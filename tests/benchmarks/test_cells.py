@@ -13,7 +13,6 @@ from scipy import fft, linalg
 from ommatid.analysis.summary import METHODS
 from ommatid.interface import calibrate, read_scene, render
 from ommatid.pipeline.stages import checked_setup
-from ommatid.reconstruct.detail import detailed_model
 from ommatid.reconstruct.noise import SHARED
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
@@ -70,13 +69,12 @@ def test_plans_are_refused_for_memory_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "cell", [*covering({**FACTORS, "size": (35,)}), *LARGE], ids=lambda cell: ", ".join(map(str, cell.values()))
 )
-def test_errors_are_as_stated(cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_are_as_stated(cell: Cell, tmp_path: Path) -> None:
     """The error lies in its interval to a tenth or the verdict says so, and error bars are the dense ones to 1 %.
 
     Where the map is worse than that at some pixels, exact solutions for random ones state as much on the average.
     """
     needs("llvm_ad_mono")
-    monkeypatch.setattr(detailed_model, "MAX_MEASUREMENTS", 0)  # worlds finer than f are solved as frames
     done = solved(cell, tmp_path)
     assert done.error is not None
     assert done.interval is not None

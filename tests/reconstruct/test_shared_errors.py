@@ -10,7 +10,6 @@ import pytest
 from scipy import sparse, stats
 
 from ommatid.reconstruct.assumptions import Assumptions, assumptions_for
-from ommatid.reconstruct.detail.detailed_model import DetailedModel
 from ommatid.reconstruct.frame import frame_method
 from ommatid.reconstruct.held_out.check import check_held_out
 from ommatid.reconstruct.method_choice import choose_method
@@ -269,17 +268,18 @@ def test_errors_without_effect_are_left_out_with_a_bound() -> None:
 @pytest.mark.slow
 def test_errors_act_on_detail_finer_than_f() -> None:
     stack, model, world = case("exponential", detail=2)
-    choice = replace(choose_method(stack.scene, stack.camera, exact=False), method="detail")
+    choice = choose_method(stack.scene, stack.camera, exact=False)
     assumed = assumptions_for(recorded(stack, model, world, np.random.default_rng(0)), model, choice, Execution())
-    result, operators, of_f = assumed.result(world), operators_of(assumed), assumed.method.task.model
-    assert isinstance(of_f, DetailedModel)
+    result, operators, task = assumed.result(world), operators_of(assumed), assumed.method.task
+    assert task.finer == 2
     directions, rng = model.errors(world).matrix, np.random.default_rng(1)
     shared: FloatArray = directions @ rng.normal(size=(directions.shape[1], DRAWS))
     noise = NOISE**0.5 * rng.normal(size=shared.shape)
     mean = assumed.prior.mean
-    light = model.forward(world) - of_f.light(np.full(of_f.unknowns, mean))
+    light = model.forward(world - mean)
     truth = averaged(world.reshape(model.camera.shape), 2).ravel() - mean
-    images = operators.gain(light[:, None] + shared + noise)
+    readings = (light[:, None] + shared + noise).T
+    images = np.stack([task.of_f(operators.gain(each)) for each in readings], axis=1)
     errors = np.square(images - truth[:, None]).mean(axis=0)
     given, part = result.interval, result.expected.parts["calibration"]
     assert given is not None

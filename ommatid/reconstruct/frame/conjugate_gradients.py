@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,14 @@ TRIAL_STEPS = 10  # with each of two preconditioners, where noise is uneven
 LEAST_LOCAL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
 
 
+class Preconditioner(Protocol):
+    """An approximation of C."""
+
+    def solve(self, image: FloatArray) -> FloatArray:
+        """Return about C b: (rows, columns) to (rows, columns)."""
+        ...
+
+
 class NotReachedError(InputError):
     """Conjugate gradients do not reach the requested accuracy."""
 
@@ -74,7 +83,7 @@ class FrameSystem:
     prior : 1 / P0 of independent pixels, or 1 / its spectrum, (rows, columns), under the DCT-II
     bands : the shift-invariant camera like this one, which gives P; None: steps without one
     types : the measurements of each lens type, over which weights are averaged; none: parts of `observation`
-    similar : P of the same prior and similar weights, None to make one of `bands`
+    similar : P of the same prior and similar weights, or exact; None to make one of `bands`
     """
 
     observation: Observation
@@ -82,7 +91,7 @@ class FrameSystem:
     prior: float | FloatArray
     bands: Bands | None = field(default=None, kw_only=True)
     types: tuple[slice, ...] = field(default=(), kw_only=True)
-    similar: Bands | None = field(default=None, kw_only=True)
+    similar: Preconditioner | None = field(default=None, kw_only=True)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -108,7 +117,7 @@ class FrameSystem:
         return self.observation.adjoint(self.weights * readings)
 
     @cached_property
-    def preconditioner(self) -> Bands | None:
+    def preconditioner(self) -> Preconditioner | None:
         """P of all kernels or their means, by the mean weights or scaled by local ones: what takes the fewest steps."""
         if self.similar is not None or self.bands is None:
             return self.similar

@@ -25,6 +25,7 @@ from ommatid.scenes.observation import Entries
 
 from ..methods.method import EstimationTask
 from .conjugate_gradients import BandedSystem, FrameSystem, NotReachedError, leaves_null_space
+from .reading_space import ReadingSpace
 from .swept import swept_maps
 from .variance_map import VarianceMap, frame_map, is_narrow, is_uneven, unseen_corners, ways_to_edges
 from .windows import HALOS, VARYING, Windows, by_windows, windows_map
@@ -136,6 +137,9 @@ def error_map(task: EstimationTask, system: FrameSystem, actual: FloatArray, *, 
     actual : (measurements used,) noise;  quick : True leaves out the slow maps, though others are rough
     """
     prior = task.prior.variance if system.bands is None else system.bands.prior_variance
+    if isinstance(system.similar, ReadingSpace):
+        exactly = system.similar.moments.variances(task.expected_noise, actual, task.shape_of_f)
+        return ErrorMap(VarianceMap(*exactly), MapCheck(0.0, 0.0), prior)
     if _is_small(task, actual.size):
         whole = Windows(task, actual, task.shape_of_f).map(task.model.applied, (0, 0))
         return ErrorMap(VarianceMap(*whole), MapCheck(0.0, 0.0), prior)

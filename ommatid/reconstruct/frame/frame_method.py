@@ -18,8 +18,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.fitted.kernels import KernelFootprints
 
-from ..detail.detailed_model import CAUSE as DETAIL
-from ..detail.world_prior import world_of
+from ..coarse_model import CAUSE as DETAIL
+from ..coarse_model import world_of
 from ..expected_error import ExpectedError, Interval, interval
 from ..methods.method import (
     SAME_NOISE,
@@ -45,6 +45,7 @@ from .conjugate_gradients import (
     serves,
 )
 from .error_map import MANY, ErrorMap, error_map, is_invariant
+from .reading_space import ReadingSpace, moments_of
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 INVARIANT = "every lens type is shift-invariant except at the edges"
@@ -53,7 +54,8 @@ WORLD = "the world finer than f is estimated, and f's pixels are its averages"
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
 SIMILAR = 0.1  # relative difference of mean weights up to which a preconditioner serves, which costs a step at most
 ERRORS = "errors"  # name of a FrameError among what frames share
-DRAWS = 2  # of images and noise for the expected residual
+DRAWS = 2  # of images and noise for the expected residual, at least
+DRAWN, MOST_DRAWS = 20_000, 16  # pixels of random images together, so that a mean over few pixels is from more images
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,12 @@ class FrameMethod(Method):
         if self._banded:
             banded = BandedSystem(system.observation, system.weights, system.prior, self.task.model.matrix)
             return self.shared("system", self.conditions(), lambda: banded)[0]
+        if ReadingSpace.serves(self.task):
+            conditions = replace(self.conditions(), assumed=np.ones(0))
+            found, _ = self.shared("moments", conditions, lambda: moments_of(self.task))
+            space = ReadingSpace(self.task, system, found, np.array(self.task.expected_noise))
+            if space.is_accurate:
+                return replace(system, similar=space)
         variances = np.divide(1, system.mean_weights, dtype=np.float64)
         conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
         nearly = _with_mean_kernels(system)
@@ -184,25 +192,37 @@ class FrameMethod(Method):
     def _by_detail(self) -> float:
         """Return the mean squared error by what f does not hold of a random world of the prior."""
         task = self.task
-        world = task.draw_deviation(probe(Purpose.DETAIL))
-        spectrum = 1 / np.asarray(task.precision_on(task.shape))
-        world -= world_of(task.of_f(world).reshape(task.shape_of_f), spectrum, task.finer)
-        right = self.system.right_hand_side(task.on_all_measurements(task.observe(world), 0.0))
-        return float(np.square(task.of_f(self._solve(right))).mean())
+        rng, spectrum = probe(Purpose.DETAIL), 1 / np.asarray(task.precision_on(task.shape))
+        squares = 0.0
+        for _ in range(self._draws):
+            world = task.draw_deviation(rng)
+            world -= world_of(task.of_f(world).reshape(task.shape_of_f), spectrum, task.finer)
+            squares += self._mean_square(task.observe(world))
+        return squares / self._draws
+
+    @property
+    def _draws(self) -> int:
+        """Number of random images for a mean over them."""
+        return int(np.clip(DRAWN // self.task.model.unknowns, 1, MOST_DRAWS))
+
+    def _mean_square(self, readings: FloatArray) -> float:
+        """Return the mean square of f's pixels in A g; readings : (measurements used,) g."""
+        right = self.system.right_hand_side(self.task.on_all_measurements(readings, 0.0))
+        return float(np.square(self.task.of_f(self._solve(right))).mean())
 
     def _random_power(self, actual: FloatArray, freedoms: float) -> ResidualPower:
         """Return the expected squares of the residual, by solutions for random images and noise, of f0 as true image.
 
         freedoms : trace of A H of independent pixels
         """
-        task = self.task
-        draws = DRAWS if task.model.unknowns <= MANY else 1
-        total = None
-        as_expected = task.prior.kind == "independent" and np.allclose(actual, task.expected_noise, rtol=1e-9)
-        if as_expected and actual.size > freedoms:
+        task, total, space = self.task, None, self.system.similar
+        draws = max(self._draws, DRAWS) if task.model.unknowns <= MANY else 1
+        as_expected = np.allclose(actual, task.expected_noise, rtol=1e-9)
+        if as_expected and task.prior.kind == "independent" and actual.size > freedoms:
             total = actual.size - freedoms
+        leverage = space.leverage if as_expected and isinstance(space, ReadingSpace) else None
         mean = np.zeros(task.model.unknowns)
-        inputs = ResidualInputs(lambda image: image, task.draw_deviation, actual, mean, draws, total=total)
+        inputs = ResidualInputs(lambda image: image, task.draw_deviation, actual, mean, draws, leverage, total=total)
         columns = inputs.columns()
         of_mean, of_noise = map(self._residual_of, islice(columns, 1)), map(self._residual, islice(columns, draws))
         return inputs.power(chain(of_mean, of_noise, map(self._residual_of, columns)), task.expected_noise)
@@ -258,9 +278,8 @@ class FrameMethod(Method):
             elif is_uniform(values) and uniform is not None:
                 parts[name] = uniform[1] * float(values[0]) / uniform[0]
             else:
-                random = rng.normal(size=values.size) * np.sqrt(values)
-                solved = self._solve(self.system.right_hand_side(self.task.on_all_measurements(random, 0.0)))
-                parts[name] = float(np.mean(np.square(self.task.of_f(solved))))
+                random = (rng.normal(size=values.size) * np.sqrt(values) for _ in range(self._draws))
+                parts[name] = sum(map(self._mean_square, random)) / self._draws
                 uniform = (float(values[0]), parts[name]) if is_uniform(values) else uniform
         share = mean / (sum(parts.values()) or 1.0)
         return {name: part * share for name, part in parts.items()}
@@ -272,11 +291,13 @@ class FrameMethod(Method):
         task, system, count = self.task, self.system, expected.variance.size
         bias = task.of_f(self._solve(system.apply_prior_precision(deviation)))
         along = self._noise_part(self._solve_weights(task.of_unknowns(bias)), actual)
-        random = probe(Purpose.ERROR_INTERVAL).normal(size=count)
-        gain = self._transposed_gain(self._solve_weights(task.of_unknowns(random)))
-        back = task.of_f(self._solve_weights(system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))))
+        rng, squares = probe(Purpose.ERROR_INTERVAL), 0.0
+        for _ in range(self._draws):
+            gain = self._transposed_gain(self._solve_weights(task.of_unknowns(rng.normal(size=count))))
+            right = system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))
+            squares += float(np.square(task.of_f(self._solve_weights(right))).sum()) / self._draws
         noisy = count * sum(part for name, part in expected.parts.items() if name != DETAIL)  # the world is known
-        variance = 4 * along + 2 * float(back @ back) + (map_error * noisy) ** 2
+        variance = 4 * along + 2 * squares + (map_error * noisy) ** 2
         return interval(float(bias @ bias) + noisy, variance, count)
 
 

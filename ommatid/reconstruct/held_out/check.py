@@ -25,7 +25,6 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 
 from ..assumptions import assumptions_for, with_fallback
-from ..detail.detailed_model import DetailedModel
 from ..method_choice import METHODS, MethodChoice
 from ..methods.method import EstimationTask, Execution, Method
 from ..output.run_json import HeldOutEntry, HeldOutPrior, HeldOutReport, HeldOutVerdict, HeldOutWindows
@@ -173,7 +172,7 @@ def with_fitted_prior(report: HeldOutReport) -> HeldOutReport:
 def quick_check(stack: Stack, task: EstimationTask, method: str) -> HeldOutReport | None:
     """Check a task with its own prior as a part of a run; None where it is not possible, or would take long."""
     possible = method != "fit" and task.used.any() and bool((task.expected_noise > 0).all())
-    most = MOST_QUICK_DETAILED if isinstance(task.model, DetailedModel) else MOST_QUICK
+    most = MOST_QUICK if task.finer == 1 else MOST_QUICK_DETAILED
     if not possible or task.expected_noise.size > most or len(windows(task)[0]) > 1:
         return None
     try:

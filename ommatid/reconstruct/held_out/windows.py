@@ -19,7 +19,7 @@ from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.machine import one_thread, processors
 from ommatid.scenes.camera import Camera
 
-from ..detail.detailed_model import DetailedModel
+from ..frame.reading_space import ReadingSpace, moments_of
 from ..methods.method import EstimationTask, Execution
 from ..prior import Prior, covariance_root
 from ..problem import Problem
@@ -74,7 +74,7 @@ class WindowProblem:
 def windows(task: EstimationTask) -> tuple[list[Window], int]:
     """Return the windows of a task's target that are checked, and the number that would cover it."""
     shape = task.shape
-    if _knows_detail(task) or shape[0] * shape[1] <= MOST_WHOLE:
+    if ReadingSpace.serves(task) or shape[0] * shape[1] <= MOST_WHOLE:
         return [(slice(0, shape[0]), slice(0, shape[1]))], 1
     side = min(max(WINDOW, REACHES * task.model.windowed.reach), WIDEST_WINDOW)
     rows, columns = (_intervals(size, side) for size in shape)
@@ -87,8 +87,8 @@ def held_out_sums(task: EstimationTask, execution: Execution) -> HeldOutSums:
 
     Sums are 0 where there are no others to predict from.
     """
-    if _knows_detail(task):
-        return _sums(_whole_detailed(task))
+    if ReadingSpace.serves(task):
+        return _sums(_light(task))
     chosen, _ = windows(task)
     if len(chosen) == 1:
         return _sums(next(_problems(task, chosen)))
@@ -120,26 +120,21 @@ def without_shared(task: EstimationTask) -> FloatArray:
     return np.maximum(task.expected_noise - task.shared_variance, LEAST_NOISE * task.expected_noise)
 
 
-def _knows_detail(task: EstimationTask) -> bool:
-    """True if the task's model holds the covariance of detail finer than f."""
-    return isinstance(task.model, DetailedModel) and task.model.detail_covariance is not None
-
-
-def _whole_detailed(task: EstimationTask) -> WindowProblem:
-    """Take the light on the pixels itself as what is measured: its covariance is that by f and by finer detail."""
-    model, camera, used = task.model, task.model.camera, np.flatnonzero(task.used)
-    if not isinstance(model, DetailedModel) or model.detail_covariance is None:
-        raise TypeError("expected a model with the covariance of its detail")
-    prior, matrix = task.prior_on(task.shape), model.matrix[used]
-    root: FloatArray = matrix @ (np.diag(prior.root) if prior.independent else prior.root)
+def _light(task: EstimationTask) -> WindowProblem:
+    """Take the light on the pixels as what is measured; its prior covariance is H P H^T of the world."""
+    camera, used = task.model.camera, np.flatnonzero(task.used)
+    matrix = task.model.to_sparse()[used]
     level = _level(matrix, task).toarray()
-    covariance = root @ root.T + level @ level.T + model.detail_covariance[np.ix_(used, used)]
-    noise, directions = task.expected_noise, task.shared_directions
+    covariance, noise, directions = (
+        moments_of(task).readings + level @ level.T,
+        task.expected_noise,
+        task.shared_directions,
+    )
     if directions is not None:
         covariance += (directions @ directions.T).toarray()
         noise = without_shared(task)
-    light = Prior(matrix @ prior.mean, covariance_root(covariance))
-    problem = Problem(sparse.csr_array(sparse.eye_array(used.size)), light, noise)
+    mean = matrix @ np.full(matrix.shape[1], task.prior.mean)
+    problem = Problem(sparse.csr_array(sparse.eye_array(used.size)), Prior(mean, covariance_root(covariance)), noise)
     return WindowProblem(problem, task.recorded[used], _sub_imager_of(camera, used), len(camera.sub_imagers))
 
 

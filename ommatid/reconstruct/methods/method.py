@@ -310,14 +310,12 @@ class PosteriorOperators:
 
     gain : A, (measurements used,) to (N,);  posterior : C, (N,) to (N,);  weigh : Rv^-1 on (measurements used,)
     hidden : I - A H = C P0^-1, (N,) to (N,): what the estimate lacks of an image less its mean
-    whiten : K^-1 on (measurements used,), where K K^T = Rv is not diagonal; None: the root of `weigh`
     """
 
     gain: Callable[[FloatArray], FloatArray]
     posterior: Callable[[FloatArray], FloatArray]
     weigh: Callable[[FloatArray], FloatArray]
     hidden: Callable[[FloatArray], FloatArray]
-    whiten: Callable[[FloatArray], FloatArray] | None = None
 
 
 class Method(ABC):
@@ -427,7 +425,6 @@ def _with_level(
     variance, before = level.variance_for(gain, other, task.prior_ratio), result.variance_of_sum
     beside = task.of_f(operators.gain(other)) if other.any() else np.zeros(response.size)
     more = np.maximum(variance * response**2 + 2 * beside * response, -expected.variance)
-    white = read / np.sqrt(task.expected_noise) if operators.whiten is None else operators.whiten(read)
 
     def variance_of_sum(weights: FloatArray) -> float:
         along = float(weights @ response)
@@ -436,7 +433,7 @@ def _with_level(
     return replace(
         result,
         image=result.image + level.value * response,
-        multipliers=result.multipliers - level.value * white / np.sqrt(task.expected_noise),
+        multipliers=result.multipliers - level.value * read / task.expected_noise,
         expected=replace(expected, variance=expected.variance + more, missing=expected.missing + float(more.mean())),
         variance_of_sum=variance_of_sum,
     )

@@ -193,9 +193,9 @@ class AlignedMethod(DenseMethod):
         return align(task.model.camera, task.recorded[task.used], task.expected_noise, prior, task.used)
 
     @cached_property
-    def observation(self) -> tuple[sparse.csr_array, None]:
+    def matrix(self) -> sparse.csr_array:
         """H of the measurements used with the fitted misalignments."""
-        return self.alignment.matrix[self.task.used], None
+        return self.alignment.matrix[self.task.used]
 
     def shared(
         self, name: str, conditions: Conditions, make: Callable[[], Value], tolerance: float = 0.0

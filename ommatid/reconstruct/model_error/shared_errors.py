@@ -21,7 +21,6 @@ from scipy import ndimage
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.fitted.fitted_matrix import Directions
-from ommatid.scenes.formats.picture import averaged
 
 from ..expected_error import ExpectedError, Interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
@@ -35,7 +34,6 @@ SMALL = 0.01  # mean share of the noise, below which few are enough, too
 CROSS_DRAWS = 4  # of combinations for the product with the noise
 NEIGHBOURHOOD = 9  # pixels, over which the squares of few combinations are averaged for the map
 NEGLIGIBLE = 1e-3  # of the expected error, up to which a bound on the part makes its computation needless
-LEAST_LEFT = 0.05  # of an expected square of the residual
 
 
 @dataclass(frozen=True)
@@ -63,10 +61,10 @@ class SharedErrors:
         back = operators.weigh(task.observe(operators.posterior(task.of_unknowns(weights))))
         return float(np.square(self.directions.adjoint(task.on_all_measurements(back, 0.0))).sum())
 
-    def whitened(self, task: EstimationTask, operators: PosteriorOperators) -> SharedResidual:
+    def whitened(self, task: EstimationTask) -> SharedResidual:
         """Return their whitened residuals."""
-        white = [whitened(residual, task, operators) for residual in self.residuals]
-        return SharedResidual(np.array(white, dtype=np.float32).reshape(len(white), -1), self.exact)
+        white = np.asarray(self.residuals / np.sqrt(task.expected_noise), dtype=np.float32)
+        return SharedResidual(white, self.exact)
 
     def variance_of_square(
         self, bias: FloatArray, actual: FloatArray, task: EstimationTask, operators: PosteriorOperators
@@ -82,11 +80,6 @@ class SharedErrors:
             for image in combined
         )
         return 4 * along + 2 * squared_trace(self.images @ self.images.T, self.exact) + 4 * across
-
-
-def whitened(residual: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> FloatArray:
-    """Return K^-1 r with K K^T the expected covariance of the noise: (measurements used,)."""
-    return residual / np.sqrt(task.expected_noise) if operators.whiten is None else operators.whiten(residual)
 
 
 def shared_errors(task: EstimationTask, operators: PosteriorOperators, image: FloatArray) -> SharedErrors | None:
@@ -157,7 +150,7 @@ def with_shared_errors(
     if truth is not None and errors.exact:
         given = shared_errors(task, operators, truth) or errors
     if power is not None:
-        power = _with_residuals(power, errors, given, task, operators)
+        power = _with_residuals(power, errors, given, task)
     added = _added(result, method, operators, errors, given, truth, actual, "calibration")
     return replace(added, residual_power=power)
 
@@ -222,11 +215,9 @@ def _wider(
     operators: PosteriorOperators,
 ) -> Interval:
     task = method.task
-    (rows, columns), camera = task.shape_of_f, task.model.camera
+    rows, columns = task.shape_of_f
     count, image = rows * columns, truth
-    if truth.size > task.model.unknowns:
-        image = averaged(truth.reshape(camera.world.shape), camera.detail).ravel()
-    elif truth.size < task.model.unknowns:
+    if truth.size < task.model.unknowns:
         image = task.finer**2 * task.of_unknowns(truth)
     bias = task.of_f(operators.hidden(image - method.mean))
     added = errors.variance_of_square(bias, actual, task, operators)
@@ -234,28 +225,10 @@ def _wider(
 
 
 def _with_residuals(
-    power: ResidualPower,
-    errors: SharedErrors,
-    given: SharedErrors,
-    task: EstimationTask,
-    operators: PosteriorOperators,
+    power: ResidualPower, errors: SharedErrors, given: SharedErrors, task: EstimationTask
 ) -> ResidualPower:
     """Return the expected squares of the residual with those of the errors for the image and for the true one."""
-    prior = power.prior
-    if operators.whiten is not None and task.shared_image is not None:
-        # What was whitened held the errors as independent, and so does the expected residual.
-        prior = np.maximum(prior - _as_independent(task, operators), LEAST_LEFT * prior)
-    shared = errors.whitened(task, operators)
-    of_given = shared if given is errors else given.whitened(task, operators)
+    shared = errors.whitened(task)
+    of_given = shared if given is errors else given.whitened(task)
     noise = None if power.noise is None else power.noise + of_given.power
-    return replace(power, prior=prior + shared.power, noise=noise, shared=shared, shared_given=of_given)
-
-
-def _as_independent(task: EstimationTask, operators: PosteriorOperators) -> FloatArray:
-    """Return the mean squares of whitened residuals of independent errors with the same variances."""
-    rng, root = probe(Purpose.SHARED_INDEPENDENT), np.sqrt(task.shared_variance)
-    total = np.zeros(root.size)
-    for _ in range(DRAWS):
-        draw = root * rng.normal(size=root.size)
-        total += np.square(whitened(draw - task.observe(operators.gain(draw)), task, operators))
-    return total / DRAWS
+    return replace(power, prior=power.prior + shared.power, noise=noise, shared=shared, shared_given=of_given)

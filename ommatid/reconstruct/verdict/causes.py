@@ -242,8 +242,7 @@ class _Search:
 
     def squares(self, change: FloatArray) -> FloatArray:
         """Return the squares of the whitened residual of readings without a change: (measurements used,)."""
-        residual, whiten = self.residual - self._left(change), self.operators.whiten
-        return np.square(residual / np.sqrt(self.task.expected_noise) if whiten is None else whiten(residual))
+        return np.square(self.residual - self._left(change)) / self.task.expected_noise
 
     def best(self) -> list[Found]:
         """Return the most likely fault of few numbers, of many by sub-imager or region, and of single readings."""

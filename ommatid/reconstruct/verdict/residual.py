@@ -117,7 +117,6 @@ class ResidualInputs:
     deviation : (N,) f - f0 of the true image, None without it
     leverage : (M,) exact (H A)_ii where the noise is as expected, None where it is not known
     optimal : True if the estimate is that of minimum variance
-    whiten : applied to the noise where the estimator whitens correlated measurements, None where it does not
     total : sum of the expected squares where the noise is as expected, None where it is not known better than by draws
     """
 
@@ -128,7 +127,6 @@ class ResidualInputs:
     draws: int
     leverage: FloatArray | None = None
     optimal: bool = True
-    whiten: Callable[[FloatArray], FloatArray] | None = None
     total: float | None = None
 
     @property
@@ -152,7 +150,7 @@ class ResidualInputs:
     def _noise(self, rng: np.random.Generator) -> FloatArray:
         noise = rng.normal(size=self.actual.size)
         noise *= np.sqrt(self.actual)
-        return noise if self.whiten is None else self.whiten(noise)
+        return noise
 
     def block(self) -> FloatArray:
         """All columns together: (M, count)."""

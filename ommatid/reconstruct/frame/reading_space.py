@@ -1,0 +1,76 @@
+"""C of few readings, by the covariance of these: C = P - P H^T S^-1 H P, S = H P H^T + Rv.
+
+It is exact but for rounding, whatever the camera, and rounding takes no digits that matter while the noise is not tiny
+against the readings' variance. As a preconditioner it makes one or two steps of conjugate gradients do, and these state
+what rounding has left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import fft, linalg
+
+from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.machine import processors
+
+from ..methods.method import EstimationTask
+from .conjugate_gradients import FrameSystem
+from .variance_map import Moments, moments
+
+MOST_READINGS = 1_500  # up to which S takes a fraction of a second, and
+MOST_UNKNOWNS = 32_000  # pixels of the world, up to which H P H^T takes some seconds
+LEAST_NOISE = 1e-10  # of the readings' variance
+
+
+@dataclass(frozen=True)
+class ReadingSpace:
+    """C of a task with few readings; `noise` is Rv, (measurements used,)."""
+
+    task: EstimationTask
+    system: FrameSystem
+    moments: Moments
+    noise: FloatArray
+
+    @staticmethod
+    def serves(task: EstimationTask) -> bool:
+        """Return True for the few readings of a world finer than f."""
+        few = task.expected_noise.size <= MOST_READINGS and task.model.unknowns <= MOST_UNKNOWNS
+        return task.finer > 1 and few
+
+    @property
+    def is_accurate(self) -> bool:
+        """True if S is not singular in float64."""
+        return float(self.noise.min(initial=np.inf)) > LEAST_NOISE * float(self.moments.readings.max(initial=0.0))
+
+    @cached_property
+    def _factor(self) -> tuple[FloatArray, bool]:
+        covariance = self.moments.readings + np.diag(self.noise)
+        return linalg.cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
+
+    @cached_property
+    def leverage(self) -> FloatArray:
+        """The diagonal of H A = I - Rv S^-1: (measurements used,)."""
+        inverse = linalg.cho_solve(self._factor, np.eye(self.noise.size), check_finite=False)
+        return 1 - self.noise * np.diagonal(inverse)
+
+    def solve(self, image: FloatArray) -> FloatArray:
+        """Return C b: (rows, columns) to (rows, columns)."""
+        spread = self._of_prior(image)
+        readings = linalg.cho_solve(self._factor, self.task.observe(spread.ravel()), check_finite=False)
+        back = self.system.observation.adjoint(self.task.on_all_measurements(readings, 0.0))
+        return spread - self._of_prior(back.reshape(image.shape))
+
+    def _of_prior(self, image: FloatArray) -> FloatArray:
+        """Return P w: (rows, columns)."""
+        waves = fft.dctn(image, 2, norm="ortho", workers=processors())
+        waves /= self.system.prior
+        return np.asarray(fft.idctn(waves, 2, norm="ortho", workers=processors(), overwrite_x=True))
+
+
+def moments_of(task: EstimationTask) -> Moments:
+    """Return the prior covariances of f's pixels and the readings that are used."""
+    spectrum = np.broadcast_to(1 / np.asarray(task.precision_on(task.shape)), task.shape)
+    return moments(task.model.to_sparse()[task.used], spectrum, task.finer)

@@ -9,6 +9,7 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
+from scipy import fft
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -67,6 +68,8 @@ def verdict_of(
         spurious=_spurious(spurious, expected) if total else 0.0,
         spurious_share=float(spurious.mean()),
         calibration_share=expected.parts.get("calibration", 0.0) / expected.mse if expected.mse else 0.0,
+        hidden=expected.missing / expected.mse if expected.mse else 0.0,
+        kurtosis=_kurtosis(assumed.method),
         fit_doubtful=assumed.fit is not None and assumed.fit.doubtful,
         fit_flat=assumed.fit is not None and assumed.fit.flat,
         noise_fitted=assumed.fit is not None and assumed.fit.noise_variance is not None,
@@ -90,6 +93,16 @@ def verdict_of(
         return likely_cause(assumed.method, stack, excess)
 
     return judge(residual_parts(residual, stack.camera), check, cause)
+
+
+def _kurtosis(method: Method) -> float:
+    """Return the kurtosis of P0^-1/2 (f^ - f0) over the pixels, 3 for images of the prior; 0 without any contrast."""
+    task = method.task
+    precision = np.asarray(task.precision_on(task.shape))
+    waves = fft.dctn((method.image - method.mean).reshape(task.shape), 2, norm="ortho") * np.sqrt(precision)
+    waves[0, 0] = 0.0
+    squares = np.square(fft.idctn(waves, 2, norm="ortho"))
+    return float(np.square(squares).mean()) / (float(squares.mean()) ** 2 or np.inf)
 
 
 def _rounding_share(noise: Noise) -> float:

@@ -285,6 +285,22 @@ def test_detail_that_the_lens_averages_out_is_doubtful(contrast: float) -> None:
     assert ("detail that no lens shows" in doubts) == (contrast > 0)
 
 
+def test_error_bars_of_stars_are_doubtful() -> None:
+    """Bright points are a draw of no Gaussian prior: their errors exceed their bars. Six images of a prior do not."""
+    described = wide(SHAPE, FITTED[:1], noise={"variance": 1.0}, prior={"kind": "fit"})
+    model = model_of(SHAPE, FITTED[:1])
+    stars = np.full(SHAPE, 4.0)
+    stars[tuple(np.random.default_rng(0).integers(0, SHAPE[0], (2, 7)))] = 250.0
+    result = restore(recorded(described, stars.ravel(), 1.0), model, stars.ravel())
+    scores = np.abs(result.estimate - stars.ravel()) / np.sqrt(result.expected.variance)
+    assert np.mean(scores[stars.ravel() > 100] > 2.58) > 0.2
+    assert "contrast lies in few places" in " ".join(result.verdict.doubts)
+    for seed in range(6):
+        image = drawn(natural(2.5, 6.0, 900.0), seed)
+        verdict = restore(recorded(described, image, 1.0, seed), model, image).verdict
+        assert "contrast lies in few places" not in " ".join((*verdict.doubts, *verdict.notes))
+
+
 @pytest.mark.parametrize(("picture", "said"), [(True, "fitted to the scene's picture"), (False, "1/frequency^2")])
 def test_a_prediction_fits_the_prior_to_the_picture(picture: bool, said: str) -> None:
     """Its error is that of the stack's own fit within a third; without a picture it says what it takes."""

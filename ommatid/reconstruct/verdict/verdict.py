@@ -29,6 +29,8 @@ ROUGH = 0.05  # relative error of a map of variances from which it is a doubt
 STRIKING = 1.5  # ratio to the whole from which a region is worth naming
 UNCERTAIN = ": the uncertainty of H is more than a small correction; "
 APART = 1.5  # ratio of the RMS error to expect for a picture to the stated one, from which its error bars are doubtful
+PEAKED, POINTS = 7.0, 20.0  # kurtosis of an estimate from which it is worth a note, and a doubt
+LEAST_HIDDEN = 0.3  # share of the prior's part in the error, below which the picture's contrast hardly matters to it
 SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 
@@ -47,7 +49,8 @@ class ErrorCheck:
     variance_bound : on the relative error of variances
     spurious : relative error of Eq. 5 by the noise of H beyond what it counts
     spurious_share : of a pixel's information, on average
-    calibration_share : of the predicted error that the uncertainty of H causes
+    calibration_share : of the predicted error that the uncertainty of H causes;  hidden : that the prior leaves open
+    kurtosis : of the estimate in units of the prior, 3 for images of the prior
     undithered : noise over the quantisation step, None where it is large enough to make rounding errors independent
     rounding_share : of the noise
     pixels_used : sensor pixels;  left_out : sub-imagers without any usable pixel, by name
@@ -61,6 +64,8 @@ class ErrorCheck:
     spurious: float
     spurious_share: float
     calibration_share: float
+    hidden: float
+    kurtosis: float
     fit_doubtful: bool
     fit_flat: bool
     noise_fitted: bool
@@ -268,6 +273,11 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
         (findings.doubts if check.interval is None else findings.notes).append(
             "noise alone explains the measurements: the image is about grey, and its error bars hold the contrast that"
             " such noise hides in natural pictures on average"
+        )
+    if check.kurtosis >= PEAKED and check.hidden >= LEAST_HIDDEN:
+        (findings.doubts if check.kurtosis >= POINTS else findings.notes).append(
+            f"the picture's contrast lies in few places, such as points or edges (kurtosis {check.kurtosis:.2g}, 3 for"
+            " the prior's images): error bars are averages, smaller than the errors there and larger elsewhere"
         )
     if check.left_out:
         findings.notes.append(

@@ -217,8 +217,9 @@ def _assumptions(
         # The uncertainty of H was taken at an image that the first prior had left noisy.
         better, fitted = _with_fit(first, model, noise, fit)
         image = preliminary(better, fitted).image
-        noise = better.noise(image, shared=SHARED in noise)
-        fit = _fit(first, noise)
+        before, noise = total_variance(noise), better.noise(image, shared=SHARED in noise)
+        if float(np.abs(total_variance(noise) - before).sum()) > NEGLIGIBLE * float(before.sum()):
+            fit = _fit(first, noise)
     if fit is not None:
         observation, noise = _with_fit(first, model, noise, fit)
     fixed = observation.expects_fixed_noise

@@ -14,6 +14,7 @@ from ommatid.scenes.scene import Scene
 from .estimator.estimate import needed_memory
 from .frame.conjugate_gradients import band_width, band_work, leaves_null_space, serves
 from .frame.frame_method import FrameMethod
+from .frame.reading_space import MOST_READINGS, MOST_UNKNOWNS
 from .frame.variance_map import LONG
 from .frame.windows import CORE, HALOS
 from .methods.dense_method import DenseMethod
@@ -160,7 +161,9 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
         side = scene.tiles.size**2
         return PROGRAM_MEMORY + images + entries + 2 * processors() * needed_memory(3 * side, side)
     if camera.has_detail and scene.prior.kind != "independent":
-        return PROGRAM_MEMORY + images + entries + 8 * WORLD_IMAGES * camera.world.unknowns
+        few = camera.measurements <= MOST_READINGS and camera.world.unknowns <= MOST_UNKNOWNS
+        columns = WORLD_IMAGES + (2 * camera.measurements if few else 0)  # H and its product with the prior
+        return PROGRAM_MEMORY + images + entries + 8 * columns * camera.world.unknowns
     if not correlated and serves(camera):
         band = 8 * camera.unknowns * band_width(camera)
         return PROGRAM_MEMORY + images + entries + 5 * band  # the factor, a copy, and two matrices per block of lines

@@ -154,6 +154,23 @@ def test_a_frame_estimates_the_world_and_averages_it(kind: str, monkeypatch: pyt
     assert of_f.interval.mse == pytest.approx(exact.expected.mse, rel=0.4)
 
 
+def test_noise_far_below_the_detail_takes_no_digits() -> None:
+    """At a noise variance of 1e-10 the error is that of detail and null space, as at 1e-4."""
+    shown = case("misaligned")
+    world = drawn(shown, 1)
+    found: list[Reconstruction] = []
+    for noise in (1e-4, 1e-10):
+        table = shown.scene.estimator.model_copy(update={"noise_variance": noise})
+        stack = shown.recorded(world, 3)
+        scene = stack.scene.model_copy(update={"estimator": table})
+        found.append(restore(replace(stack, scene=scene), shown.model, world))
+    first, second = (each.expected.missing + each.expected.parts["detail"] for each in found)
+    assert second == pytest.approx(first, rel=1e-2)
+    assert found[1].solver.bound is not None
+    assert found[1].solver.bound <= 0.01
+    assert found[1].solver.variance_bound < 0.05
+
+
 @cache
 def blurred(prior_kind: str) -> tuple[Setup, Model]:
     """Apertures whose Airy patterns are wider than the target, before a world three times finer, without entries."""

@@ -185,7 +185,7 @@ class FrameSystem:
                 # The residual is rounding error, for which the bound by the prior alone is too pessimistic.
                 bound = (max(float(residual @ self._precondition(residual)), 0.0) / (SAFETY * lanczos.least)) ** 0.5
             if bound > accuracy:
-                raise NotReachedError(_not_reached(bound, lanczos.count, accuracy))
+                raise NotReachedError(self._not_reached(bound, lanczos.count, accuracy))
         return Solution(image, lanczos.count, bound, lanczos.largest / lanczos.least if lanczos.count else 1.0)
 
     def solve_weights(self, weights: FloatArray, accuracy: float) -> FloatArray:
@@ -218,7 +218,7 @@ class FrameSystem:
             if bound <= accuracy:
                 break
             if lanczos.count >= MAX_STEPS or not np.isfinite(bound):
-                raise NotReachedError(_not_reached(bound, lanczos.count, accuracy))
+                raise NotReachedError(self._not_reached(bound, lanczos.count, accuracy))
         return image, lanczos if lanczos.count else before
 
     def _residuals(self, image: FloatArray, residual: FloatArray, lanczos: _Lanczos) -> Iterator[FloatArray]:
@@ -243,6 +243,14 @@ class FrameSystem:
             lanczos.lengths.append(energy / float(direction @ product))
             image += lanczos.lengths[-1] * direction
             residual -= lanczos.lengths[-1] * product
+
+    def _not_reached(self, bound: float, steps: int, accuracy: float) -> str:
+        finer = self.bands is not None and self.bands.detail > 1
+        other = "raise the noise" if finer else "set estimator.method = 'tiles'"
+        return (
+            f"the frame solver reached {bound:.2g} posterior standard deviations after {steps} steps, expected"
+            f" {accuracy:g}; {other}, or raise estimator.accuracy"
+        )
 
     def _bound(self, residual: FloatArray) -> float:
         """Upper bound on sqrt(r^T K^-1 r): sqrt(r^T P0 r)."""
@@ -288,13 +296,6 @@ def posterior_operators(
         posterior=posterior if of_weights is None else of_weights,
         weigh=lambda values: values / task.expected_noise,
         hidden=lambda image: posterior(system.apply_prior_precision(image)),
-    )
-
-
-def _not_reached(bound: float, steps: int, accuracy: float) -> str:
-    return (
-        f"the frame solver reached {bound:.2g} posterior standard deviations after {steps} steps, expected"
-        f" {accuracy:g}; set estimator.method = 'tiles', or raise estimator.accuracy"
     )
 
 

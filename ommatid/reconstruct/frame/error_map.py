@@ -138,8 +138,9 @@ def error_map(task: EstimationTask, system: FrameSystem, actual: FloatArray, *, 
     """
     prior = task.prior.variance if system.bands is None else system.bands.prior_variance
     if isinstance(system.similar, ReadingSpace):
-        exactly = system.similar.moments.variances(task.expected_noise, actual, task.shape_of_f)
-        return ErrorMap(VarianceMap(*exactly), MapCheck(0.0, 0.0), prior)
+        maps = VarianceMap(*system.similar.moments.variances(task.expected_noise, actual, task.shape_of_f))
+        rounding = system.similar.rounding(maps.posterior.ravel())
+        return ErrorMap(maps, MapCheck(rounding, rounding), prior)
     if _is_small(task, actual.size):
         whole = Windows(task, actual, task.shape_of_f).map(task.model.applied, (0, 0))
         return ErrorMap(VarianceMap(*whole), MapCheck(0.0, 0.0), prior)

@@ -99,7 +99,7 @@ class FrameMethod(Method):
             conditions = replace(self.conditions(), assumed=np.ones(0))
             found, _ = self.shared("moments", conditions, lambda: moments_of(self.task))
             space = ReadingSpace(self.task, system, found, np.array(self.task.expected_noise))
-            if space.is_accurate:
+            if space.is_regular:
                 return replace(system, similar=space)
         variances = np.divide(1, system.mean_weights, dtype=np.float64)
         conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
@@ -261,11 +261,13 @@ class FrameMethod(Method):
 
     def _noise_part(self, solved: FloatArray, actual: FloatArray) -> float:
         """The part of Eq. 5 from noise of (measurements used,) variance `actual`, for c = C w."""
-        return float(actual @ np.square(self._transposed_gain(solved)))
+        return float(actual @ np.square(self.task.observe(solved) / self.task.expected_noise))
 
-    def _transposed_gain(self, solved: FloatArray) -> FloatArray:
-        """A^T w from c = C w: (measurements used,)."""
-        return self.task.observe(solved) / self.task.expected_noise
+    def _transposed_gain(self, weights: FloatArray) -> FloatArray:
+        """Return A^T w = Rv^-1 H C w: (unknowns,) to (measurements used,)."""
+        if isinstance(self.system.similar, ReadingSpace):
+            return self.system.similar.transposed_gain(weights)
+        return self.task.observe(self._solve_weights(weights)) / self.task.expected_noise
 
     def _parts(self, noise: dict[str, FloatArray], mean: float) -> dict[str, float]:
         """Share of each cause of noise in the mean of Eq. 5; they add up to `mean`."""
@@ -290,10 +292,10 @@ class FrameMethod(Method):
         """Interval of the mean squared error of the true image; that less its prior's mean is `deviation`."""
         task, system, count = self.task, self.system, expected.variance.size
         bias = task.of_f(self._solve(system.apply_prior_precision(deviation)))
-        along = self._noise_part(self._solve_weights(task.of_unknowns(bias)), actual)
+        along = float(actual @ np.square(self._transposed_gain(task.of_unknowns(bias))))
         rng, squares = probe(Purpose.ERROR_INTERVAL), 0.0
         for _ in range(self._draws):
-            gain = self._transposed_gain(self._solve_weights(task.of_unknowns(rng.normal(size=count))))
+            gain = self._transposed_gain(task.of_unknowns(rng.normal(size=count)))
             right = system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))
             squares += float(np.square(task.of_f(self._solve_weights(right))).sum()) / self._draws
         noisy = count * sum(part for name, part in expected.parts.items() if name != DETAIL)  # the world is known

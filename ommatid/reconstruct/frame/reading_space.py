@@ -1,8 +1,7 @@
 """C of few readings, by the covariance of these: C = P - P H^T S^-1 H P, S = H P H^T + Rv.
 
-It is exact but for rounding, whatever the camera, and rounding takes no digits that matter while the noise is not tiny
-against the readings' variance. As a preconditioner it makes one or two steps of conjugate gradients do, and these state
-what rounding has left.
+It is exact but for rounding, whatever the camera. As a preconditioner it makes one or two steps of conjugate gradients
+do, and these state what rounding has left.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from .variance_map import Moments, moments
 
 MOST_READINGS = 1_500  # up to which S takes a fraction of a second, and
 MOST_UNKNOWNS = 32_000  # pixels of the world, up to which H P H^T takes some seconds
-LEAST_NOISE = 1e-10  # of the readings' variance
 
 
 @dataclass(frozen=True)
@@ -40,10 +38,13 @@ class ReadingSpace:
         few = task.expected_noise.size <= MOST_READINGS and task.model.unknowns <= MOST_UNKNOWNS
         return task.finer > 1 and few
 
-    @property
-    def is_accurate(self) -> bool:
+    @cached_property
+    def is_regular(self) -> bool:
         """True if S is not singular in float64."""
-        return float(self.noise.min(initial=np.inf)) > LEAST_NOISE * float(self.moments.readings.max(initial=0.0))
+        try:
+            return bool(np.isfinite(self._factor[0]).all())
+        except linalg.LinAlgError:
+            return False
 
     @cached_property
     def _factor(self) -> tuple[FloatArray, bool]:
@@ -56,12 +57,26 @@ class ReadingSpace:
         inverse = linalg.cho_solve(self._factor, np.eye(self.noise.size), check_finite=False)
         return 1 - self.noise * np.diagonal(inverse)
 
+    def rounding(self, posterior: FloatArray) -> float:
+        """Return a bound on the relative error of posterior variances, (N,), by rounding: that of both^T S^-1 both."""
+        gain = np.asarray(linalg.cho_solve(self._factor, self.moments.both.T, check_finite=False))
+        largest = float(np.trace(self.moments.readings)) + float(self.noise.max(initial=0.0))
+        lost = np.finfo(float).eps * largest * np.square(gain).sum(axis=0)
+        return float(np.divide(lost, posterior, out=np.ones_like(lost), where=posterior > 0).max())
+
     def solve(self, image: FloatArray) -> FloatArray:
         """Return C b: (rows, columns) to (rows, columns)."""
         spread = self._of_prior(image)
-        readings = linalg.cho_solve(self._factor, self.task.observe(spread.ravel()), check_finite=False)
-        back = self.system.observation.adjoint(self.task.on_all_measurements(readings, 0.0))
+        back = self.system.observation.adjoint(self.task.on_all_measurements(self._weights(spread), 0.0))
         return spread - self._of_prior(back.reshape(image.shape))
+
+    def transposed_gain(self, weights: FloatArray) -> FloatArray:
+        """Return A^T w = S^-1 H P w: (unknowns,) to (measurements used,)."""
+        return self._weights(self._of_prior(weights.reshape(self.task.shape)))
+
+    def _weights(self, spread: FloatArray) -> FloatArray:
+        """Return S^-1 H w: (rows, columns) to (measurements used,)."""
+        return linalg.cho_solve(self._factor, self.task.observe(spread.ravel()), check_finite=False)
 
     def _of_prior(self, image: FloatArray) -> FloatArray:
         """Return P w: (rows, columns)."""

@@ -86,7 +86,7 @@ class Assumptions:
         if operators is None:
             return result
         task = method.task
-        cosine, sine = common_rounding(self.noise, task.model.light(method.image)[task.used])
+        cosine, sine = common_rounding(self.noise, task.model.forward(method.image)[task.used])
         every = (task.on_all_measurements(each, 0.0) for each in (cosine, sine))
         columns = np.stack([of_smooth_parts(each, task.model.applied)[task.used] for each in every])
         actual = total_variance(self._independent_noise)
@@ -182,8 +182,8 @@ def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution:
         of_image = assumed.method.task.model
         values, pixels = censored(stack, of_image, usable, image, assumed.fit)
         assumed = _assumptions(values, model, pixels, choice, execution)
-        before, image = of_image.light(image), assumed.method.image
-        if has_converged(before, assumed.method.task.model.light(image), stack, usable):
+        before, image = of_image.forward(image), assumed.method.image
+        if has_converged(before, assumed.method.task.model.forward(image), stack, usable):
             break
     return assumed
 

@@ -20,6 +20,7 @@ from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.fitted.fitted_matrix import Directions
 from ommatid.scenes.model import Model
 from ommatid.scenes.observation import Observation
+from ommatid.scenes.observation import repetition as repeated
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .prior import averaged_spectrum
@@ -87,13 +88,11 @@ def model_of_f(model: Model, camera: Camera, prior: PriorTable) -> Model:
 
 def _made_of_pixels(model: Model, camera: Camera) -> CoarseModel:
     """Return the model of a world that is made of f's pixels."""
-    expansion, coarse, stored = repetition(camera.shape, camera.detail), None, None
-    if model.stored is not None:
-        stored = sparse.csr_array(model.stored @ expansion)
-    else:
-        coarse = model.observation.coarser(camera, camera.detail)
-        if camera.unknowns <= MOST_DENSE:
-            stored, coarse = coarse.to_sparse(), None
+    expansion = repetition(camera.shape, camera.detail)
+    coarse: Observation | None = model.observation.coarser(camera, camera.detail)
+    stored = None
+    if model.stored is not None or camera.unknowns <= MOST_DENSE:
+        stored, coarse = coarse.to_sparse(), None
     count = 0 if stored is None else int(stored.nnz)
     variance = np.zeros(count)
     if stored is not None and model.variance.any():
@@ -119,15 +118,9 @@ def _entry_variance(model: Model, matrix: sparse.csr_array, expansion: sparse.cs
     return np.asarray(sparse.csr_array(variance)[rows, matrix.indices], dtype=np.float64).ravel()
 
 
-def averaging(shape: tuple[int, int], detail: int) -> sparse.csr_array:
-    """Return A, the averages over detail x detail pixels of the world: (N, pixels of the world)."""
-    rows, columns = (sparse.kron(sparse.eye_array(size), np.full((1, detail), 1 / detail)) for size in shape)
-    return sparse.csr_array(sparse.kron(rows, columns, format="csr"))
-
-
 def repetition(shape: tuple[int, int], detail: int) -> sparse.csr_array:
     """Return R, the world made of f's pixels, each repeated detail x detail times: (pixels of the world, N)."""
-    return sparse.csr_array(averaging(shape, detail).T * float(detail**2))
+    return sparse.csr_array(sparse.kron(*(repeated(size, detail) for size in shape), format="csr"))
 
 
 def world_of(image: FloatArray, spectrum: FloatArray, detail: int) -> FloatArray:

@@ -106,7 +106,7 @@ def known_noise(stack: Stack, light: FloatArray | None = None) -> Noise:
 
 def noise_at(stack: Stack, model: Model, image: FloatArray) -> Noise:
     """Return the variances, (M,), at an estimate, (N,), with that by the uncertainty of H."""
-    noise = known_noise(stack, None if stack.recording is None else model.light(image))
+    noise = known_noise(stack, None if stack.recording is None else model.forward(image))
     return noise | {"calibration": model.variance_from_model(image)} if model.variance.any() else noise
 
 
@@ -287,7 +287,7 @@ def censored(
     """
     noise, shared = noise_at(stack, model, image), model.errors(image)
     variance = total_variance(fitted_noise(noise if shared is None else noise | {SHARED: shared.variance}, fit))
-    light, deviation = model.light(image), np.sqrt(variance)
+    light, deviation = model.forward(image), np.sqrt(variance)
     with np.errstate(invalid="ignore", divide="ignore"):
         below = (_limit(stack) - light) / deviation
     ratio = np.exp(-0.5 * below**2 - special.log_ndtr(-below)) / (2 * np.pi) ** 0.5

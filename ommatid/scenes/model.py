@@ -124,10 +124,6 @@ class Model:
         """H f: (N,) or (rows, columns) to (M,)."""
         return self.observation.forward(image)
 
-    def light(self, image: FloatArray) -> FloatArray:
-        """Expected light on every sensor pixel for an image: (N,) to (M,)."""
-        return self.forward(image)
-
     def adjoint(self, measurements: FloatArray) -> FloatArray:
         """H^T g: (M,) to (N,)."""
         return self.observation.adjoint(measurements)

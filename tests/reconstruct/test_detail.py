@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ommatid.reconstruct.coarse_model import CoarseModel, averaging, model_of_f, repetition
+from ommatid.reconstruct.coarse_model import CoarseModel, model_of_f, repetition
 from ommatid.reconstruct.frame import reading_space
 from ommatid.reconstruct.held_out.check import check_held_out
 from ommatid.reconstruct.prior import coloured, prior_of, spectrum_of
@@ -75,7 +75,7 @@ def case(kind: str, prior_kind: str = "exponential") -> Case:
     if prior_kind == "exponential":
         root = prior_of(described.prior, camera.shape, camera.target_pitch).root
         covariance = root @ root.T
-    return Case(setup, model, covariance, averaging((11, 11), 2).toarray())
+    return Case(setup, model, covariance, repetition((11, 11), 2).T.toarray() / 4)
 
 
 def drawn(case: Case, seed: int) -> Array:
@@ -219,7 +219,7 @@ def test_a_camera_of_whole_pixels_has_no_detail() -> None:
     assert [each.why for each in setup.skipped if each.what == "detail"] == [
         "every sensor pixel covers whole pixels of f"
     ]
-    left = ideal_matrix(setup.world.camera) - ideal_matrix(setup.camera) @ averaging((19, 19), 3)
+    left = ideal_matrix(setup.world.camera) - ideal_matrix(setup.camera) @ (repetition((19, 19), 3).T / 9)
     assert np.abs(left.toarray()).max() < 1e-9
 
 

@@ -125,11 +125,8 @@ def _light(task: EstimationTask) -> WindowProblem:
     camera, used = task.model.camera, np.flatnonzero(task.used)
     matrix = task.model.to_sparse()[used]
     level = _level(matrix, task).toarray()
-    covariance, noise, directions = (
-        moments_of(task).readings + level @ level.T,
-        task.expected_noise,
-        task.shared_directions,
-    )
+    covariance, noise = moments_of(task).readings + level @ level.T, task.expected_noise
+    directions = task.shared_directions
     if directions is not None:
         covariance += (directions @ directions.T).toarray()
         noise = without_shared(task)

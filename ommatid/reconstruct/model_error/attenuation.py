@@ -35,20 +35,19 @@ UNCERTAINTY = 0.07  # of what the errors of H add to the error, relative: noise 
 
 @dataclass(frozen=True)
 class Effect:
-    """What the errors of H do to the estimate of an image, (N,).
+    """What the errors of H do to the estimate of an image, (unknowns,).
 
-    lacking : (N,) what the estimate lacks of it without such errors;  halves : C D image by either half of the batches
+    lacking : what the estimate lacks of it without such errors;  halves : C D image by either half of the batches
     """
 
     image: FloatArray
     lacking: FloatArray
     halves: tuple[FloatArray, FloatArray]
 
-    @property
-    def added(self) -> float:
-        """|lacking + C D image|^2 - |lacking|^2, from two independent estimates of C D image."""
-        first, second = self.halves
-        return float(first @ second + self.lacking @ (first + second))
+    def added(self, task: EstimationTask) -> float:
+        """Return |lacking + C D image|^2 - |lacking|^2 over f's pixels, by two independent estimates of C D image."""
+        first, second = (task.of_f(half) for half in self.halves)
+        return float(first @ second + task.of_f(self.lacking) @ (first + second))
 
 
 @dataclass(frozen=True)
@@ -142,9 +141,8 @@ def _likely_leverage(task: EstimationTask) -> FloatArray:
 
 
 def can_be_corrected(method: Method) -> bool:
-    """Return True if the batches of the calibration can show the attenuation, on f's own grid."""
-    task = method.task
-    return task.finer == 1 and bool(task.used.any()) and task.model.has_error_halves
+    """Return True if the batches of the calibration can show the attenuation."""
+    return bool(method.task.used.any()) and method.task.model.has_error_halves
 
 
 def with_attenuation(
@@ -157,7 +155,8 @@ def with_attenuation(
 ) -> MethodResult:
     """Return a result whose Eq. 5 and interval hold the attenuation, or the same where its first order does not serve.
 
-    image : (N,) with the contrast of the true one;  truth : (N,), or None;  actual : (measurements used,) variances
+    image : (unknowns,) with the contrast of the true one;  truth : likewise, or None
+    actual : (measurements used,) variances
     """
     task, rng, root = method.task, probe(Purpose.ATTENUATION), np.sqrt(actual)
     white = rng.normal(size=root.size)
@@ -169,7 +168,7 @@ def with_attenuation(
         return result
     average = attenuation.effect(image + unseen, method.mean)
     given = None if truth is None else attenuation.effect(truth, method.mean)
-    first, second = average.halves
+    first, second = (task.of_f(half) for half in average.halves)
     before, power = result.variance_of_sum, result.residual_power
 
     def variance_of_sum(weights: FloatArray) -> float:
@@ -178,10 +177,11 @@ def with_attenuation(
     if power is not None:
         change = None if given is None else attenuation.residual_change(task, given)
         power = _with_change(power, attenuation.residual_change(task, average), change)
-    expected = _with_added(result.expected, max(average.added, 0.0), first + second, task.shape)
+    expected = _with_added(result.expected, max(average.added(task), 0.0), first + second, task.shape_of_f)
+    second_order = max(attenuation.strength(sum(average.halves, np.zeros_like(unseen))), 0.0)
     return replace(
         result,
-        expected=replace(expected, second_order=max(attenuation.strength(first + second), 0.0)),
+        expected=replace(expected, second_order=second_order),
         interval=result.interval if given is None else _shifted(result, given, method, operators, actual),
         variance_of_sum=variance_of_sum,
         residual_power=power,
@@ -212,9 +212,10 @@ def _shifted(
     result: MethodResult, effect: Effect, method: Method, operators: PosteriorOperators, actual: FloatArray
 ) -> Interval | None:
     """Return the interval with the attenuation of the true image: its square, and its product with the noise."""
-    without, count, (first, second) = result.interval, effect.image.size, effect.halves
+    without, count, task = result.interval, result.image.size, method.task
     if without is None:
         return None
-    along = operators.weigh(method.task.observe(operators.posterior((first + second) / 2)))
-    unknown = UNCERTAINTY * (effect.added + count * result.expected.parts.get("calibration", 0.0))
-    return without.with_added(effect.added, 4 * float(actual @ np.square(along)) + unknown**2, count)
+    mean = task.of_f(effect.halves[0] + effect.halves[1]) / 2
+    along, added = operators.weigh(task.observe(operators.posterior(task.of_unknowns(mean)))), effect.added(task)
+    unknown = UNCERTAINTY * (added + count * result.expected.parts.get("calibration", 0.0))
+    return without.with_added(added, 4 * float(actual @ np.square(along)) + unknown**2, count)

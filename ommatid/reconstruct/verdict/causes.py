@@ -199,7 +199,7 @@ class _Search:
         if operators is None:
             raise TypeError("expected noise in every measurement, without which no check finds anything wrong")
         self.camera, self.used, self.operators = method.task.model.camera, method.task.used, operators
-        filled = np.where(self.used, self.task.recorded, self.task.model.light(method.image))
+        filled = np.where(self.used, self.task.recorded, self.task.model.forward(method.image))
         pairs = zip(self.camera.sub_imagers, self.camera.slices(), strict=True)
         self.images = [filled[part].reshape(sub.type.pixels) for sub, part in pairs]
         self.of_sub = np.repeat(np.arange(len(self.images)), [image.size for image in self.images])[self.used]

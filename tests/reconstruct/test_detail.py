@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import sparse
 
 from ommatid.reconstruct.coarse_model import CoarseModel, model_of_f, repetition
 from ommatid.reconstruct.frame import reading_space
@@ -169,6 +170,39 @@ def test_noise_far_below_the_detail_takes_no_digits() -> None:
     assert found[1].solver.bound is not None
     assert found[1].solver.bound <= 0.01
     assert found[1].solver.variance_bound < 0.05
+
+
+@pytest.mark.slow
+def test_errors_of_entries_attenuate_a_finer_world() -> None:
+    """H from eight noisy batches, over 20 draws of its errors: the errors measured are those expected of the world."""
+    shown, count = case("distorted"), 8
+    world, right = drawn(shown, 1), shown.model.matrix
+    ratios: list[float] = []
+    for seed in range(20):
+        errors = np.random.default_rng(seed).normal(size=(count, right.nnz)) * 0.2 * np.sqrt(right.data)
+        errors -= (np.add.reduceat(errors, right.indptr[:-1], axis=1) / np.diff(right.indptr)).repeat(
+            np.diff(right.indptr), axis=1
+        )
+        mean = errors.mean(axis=0)
+        stored = sparse.csr_array((right.data + mean, right.indices, right.indptr), shape=right.shape)
+        variance = np.square(errors - mean).sum(axis=0) / (count * (count - 1))
+        batches = np.asarray(errors - mean, dtype=np.float32)
+        record = {**shown.model.record, "method": "transport"}
+        noisy = replace(shown.model, stored=stored, variance=variance, batches=batches, record=record)
+        result = restore(shown.recorded(world, seed), noisy, world)
+        assert result.expected.attenuation is not None
+        assert result.error is not None
+        assert result.interval is not None
+        ratios.append(result.error.mse / result.interval.mse)
+    assert np.mean(ratios) == pytest.approx(1, abs=0.1 + 3 * float(np.std(ratios, ddof=1)) / 20**0.5)
+    print(
+        "RATIOS",
+        np.mean(ratios),
+        np.std(ratios),
+        result.expected.attenuation,
+        result.expected.mse,
+        result.expected.parts,
+    )
 
 
 @cache

@@ -174,11 +174,13 @@ def test_noise_far_below_the_detail_takes_no_digits() -> None:
 
 @pytest.mark.slow
 def test_errors_of_entries_attenuate_a_finer_world() -> None:
-    """H from eight noisy batches, over 20 draws of its errors: the errors measured are those expected of the world."""
+    """H from eight noisy batches, 20 draws: what is expected of the world errs by a fifth at most, on the safe side."""
     shown, count = case("distorted"), 8
-    world, right = drawn(shown, 1), shown.model.matrix
+    right = shown.model.matrix
     ratios: list[float] = []
+    shares: list[float] = []
     for seed in range(20):
+        world = drawn(shown, seed)
         errors = np.random.default_rng(seed).normal(size=(count, right.nnz)) * 0.2 * np.sqrt(right.data)
         errors -= (np.add.reduceat(errors, right.indptr[:-1], axis=1) / np.diff(right.indptr)).repeat(
             np.diff(right.indptr), axis=1
@@ -194,15 +196,10 @@ def test_errors_of_entries_attenuate_a_finer_world() -> None:
         assert result.error is not None
         assert result.interval is not None
         ratios.append(result.error.mse / result.interval.mse)
-    assert np.mean(ratios) == pytest.approx(1, abs=0.1 + 3 * float(np.std(ratios, ddof=1)) / 20**0.5)
-    print(
-        "RATIOS",
-        np.mean(ratios),
-        np.std(ratios),
-        result.expected.attenuation,
-        result.expected.mse,
-        result.expected.parts,
-    )
+        shares.append(result.expected.attenuation / result.expected.mse)
+        assert result.verdict.level == "green"
+    assert np.mean(shares) > 0.05
+    assert 0.8 < np.mean(ratios) < 1 + 3 * float(np.std(ratios, ddof=1)) / 20**0.5
 
 
 @cache

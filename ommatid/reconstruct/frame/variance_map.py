@@ -61,7 +61,11 @@ class Moments:
     both: FloatArray
     readings: FloatArray
 
-    def variances(self, expected: FloatArray, actual: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    def at(self, pixels: NDArray[np.intp]) -> Moments:
+        """Return those of some pixels of f, (n,)."""
+        return Moments(self.pixels[pixels], self.both[pixels], self.readings)
+
+    def variances(self, expected: FloatArray, actual: FloatArray, shape: tuple[int, ...]) -> FloatArray:
         """Return the three maps for readings with these noise variances, (M,): (3, rows, columns)."""
         covariance = self.readings + np.diag(expected)
         factor = linalg.cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
@@ -97,31 +101,35 @@ def prior_precision(prior: FloatArray, shape: tuple[int, int]) -> FloatArray:
     return np.asarray(waves.T @ (prior.ravel()[:, None] * waves), dtype=np.float64)
 
 
-def precision_map(
-    precision: FloatArray, prior: FloatArray, shape: tuple[int, int], ratio: float, excess: FloatArray | None
-) -> FloatArray:
-    """Return the diagonals of C = K^-1, C P0^-1 C and C S C of a small frame: (3, rows, columns).
+def columns_of_covariance(
+    precision: FloatArray, prior: FloatArray, shape: tuple[int, int], pixels: NDArray[np.intp] | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the columns of C = K^-1 of these pixels, (N, n), and the diagonal of C P0^-1 C at them, (n,).
 
-    precision : (N, N) K;  prior : 1 / its spectrum
-    ratio, excess : S is `ratio` times H^T Rv^-1 H plus `excess`, (N, N), which None leaves out
+    precision : (N, N) K of a small frame;  prior : 1 / its spectrum;  pixels : (n,) of few; None: all
     """
     factor, _ = factorise_positive(precision)
-    covariance = factor.inverse()
-    spread = np.asarray(fft.dctn(covariance.reshape(*shape, -1), 2, axes=(0, 1), norm="ortho"))
-    missing = np.einsum("rc,rcn->n", prior, np.square(spread))
-    posterior = np.diagonal(covariance)
-    noisy = ratio * (posterior - missing)
-    if excess is not None:
-        noisy += np.einsum("ij,ij->j", covariance, excess @ covariance)
-    return np.array([posterior, missing, noisy], dtype=np.float64).reshape(3, *shape)
+    if pixels is None or pixels.size == precision.shape[0]:
+        columns = factor.inverse()
+    else:
+        units = np.zeros((precision.shape[0], pixels.size))
+        units[pixels, np.arange(pixels.size)] = 1.0
+        columns = factor.solve(units)
+    waves = np.asarray(fft.dctn(columns.reshape(*shape, -1), 2, axes=(0, 1), norm="ortho"))
+    return columns, np.einsum("rc,rcn->n", prior, np.square(waves))
+
+
+def dense_or_sparse(matrix: sparse.csr_array) -> FloatArray | sparse.csr_array:
+    """Return H in the form whose products are faster."""
+    return matrix.toarray() if is_dense(matrix) else matrix
 
 
 def information(matrix: sparse.csr_array, weights: FloatArray) -> FloatArray:
     """Return H^T diag(w) H of few pixels: (N, N)."""
-    weighted = sparse.csr_array(matrix.multiply(weights[:, None]))
-    if is_dense(matrix):
-        return np.asarray(matrix.toarray().T @ weighted.toarray(), dtype=np.float64)
-    return np.asarray((matrix.T @ weighted).toarray(), dtype=np.float64)
+    applied = dense_or_sparse(matrix)
+    if isinstance(applied, np.ndarray):
+        return np.asarray(applied.T @ (applied * weights[:, None]), dtype=np.float64)
+    return np.asarray((applied.T @ sparse.csr_array(applied.multiply(weights[:, None]))).toarray(), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -163,7 +171,12 @@ class SmallFrame:
             if not np.isclose(ratio, first, rtol=1e-12):
                 excess = (ratio - first) * weight * part + (0.0 if excess is None else excess)
         parts = (weight * part for part, weight in zip(self._parts, weights, strict=True))
-        return precision_map(sum(parts, self._precision), 1 / like.spectrum, like.shape, first, excess)
+        covariance, missing = columns_of_covariance(sum(parts, self._precision), 1 / like.spectrum, like.shape)
+        posterior = np.diagonal(covariance)
+        noisy = first * (posterior - missing)
+        if excess is not None:
+            noisy += np.einsum("ij,ij->j", covariance, excess @ covariance)
+        return np.array([posterior, missing, noisy]).reshape(3, *like.shape)
 
     def of_readings(self, of_types: FloatArray) -> FloatArray:
         """Return the value of each reading's lens type: (readings,)."""

@@ -22,11 +22,12 @@ from .bands import Bands
 from .swept import swept_maps
 from .variance_map import (
     VarianceMap,
+    columns_of_covariance,
+    dense_or_sparse,
     information,
     is_narrow,
     mean_ratios,
     moments,
-    precision_map,
     prior_precision,
     without_edges,
 )
@@ -36,6 +37,8 @@ HALOS = 8, 12, 16  # pixels of f around it, of which a longer one takes several 
 MOST_ENTRIES = 30_000_000  # of H of a part, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
 SIDE, WINDOWS = 28, 3  # pixels of f of a window that shows what the variation of kernels does; windows along each axis
+Core = tuple[slice, ...]
+WHOLE = slice(None), slice(None)
 VARYING = 0.05  # variation of kernels from which windows count it; one of 0.09 makes a map 11 % wrong
 
 
@@ -61,8 +64,11 @@ class Windows:
         )
         return rows, columns
 
-    def map(self, observation: Observation, corner: tuple[int, int]) -> FloatArray:
-        """Return the three maps of the window that begins at `corner`, imaged by `observation`: (3, *shape)."""
+    def map(self, observation: Observation, corner: tuple[int, int], core: Core = WHOLE) -> FloatArray:
+        """Return the three maps of the core of the window that begins at `corner`, imaged by `observation`.
+
+        core : slices of the window's rows and columns;  result : (3, rows, columns) of the core
+        """
         task, shape = self.task, self.shape
         pairs = zip(corner, shape, strict=True)
         rows, columns = (slice(first * task.finer, (first + side) * task.finer) for first, side in pairs)
@@ -73,15 +79,19 @@ class Windows:
         if self.beside:
             lost = self._seen[numbers] - np.asarray(matrix.sum(axis=1)).ravel()
             expected, actual = (each + self.beside * np.square(lost) for each in (expected, actual))
+        kept = np.arange(shape[0] * shape[1]).reshape(shape)[core]
         if task.finer > 1:
-            return moments(matrix, self._spectrum, task.finer).variances(expected, actual, shape)
+            return moments(matrix, self._spectrum, task.finer).at(kept.ravel()).variances(expected, actual, kept.shape)
         if isinstance(self._prior, float) and is_narrow(task):
-            ratios = actual / expected
-            return swept_maps(matrix, 1 / expected, ratios, self._prior, shape, min(observation.reach, max(shape)))
-        precision, excess = information(matrix, 1 / expected) + self._precision, None
+            ratios, reach = actual / expected, min(observation.reach, max(shape))
+            return swept_maps(matrix, 1 / expected, ratios, self._prior, shape, reach)[:, *core]
+        precision = information(matrix, 1 / expected) + self._precision
+        covariance, missing = columns_of_covariance(precision, 1 / self._spectrum, shape, kept.ravel())
+        posterior = covariance[kept.ravel(), np.arange(kept.size)]
+        noisy = posterior - missing
         if not np.allclose(actual, expected, rtol=1e-9):
-            excess = information(matrix, actual / expected**2 - 1 / expected)
-        return precision_map(precision, 1 / self._spectrum, shape, 1.0, excess)
+            noisy = (actual / expected**2) @ np.square(dense_or_sparse(matrix) @ covariance)
+        return np.array([posterior, missing, noisy]).reshape(3, *kept.shape)
 
     def frame(self, observation: Observation) -> VarianceMap:
         """Return the maps of a whole frame from the cores of windows side by side."""
@@ -95,11 +105,16 @@ class Windows:
         corners = [
             (min(max(row - self.halo, 0), last[0]), min(max(column - self.halo, 0), last[1])) for row, column in places
         ]
-        total, (down, across) = np.empty((3, *self.task.shape_of_f)), self.core
+        cores = [
+            tuple(
+                slice(first - start, first - start + size) for first, start, size in zip(*each, self.core, strict=True)
+            )
+            for each in zip(places, corners, strict=True)
+        ]
+        total = np.empty((3, *self.task.shape_of_f))
         with one_thread(), ThreadPoolExecutor(processors()) as threads:
-            found = threads.map(partial(self.map, observation), corners)
-            for (row, column), (top, left), maps in zip(places, corners, found, strict=True):
-                core = maps[:, row - top : row - top + down, column - left : column - left + across]
+            found = threads.map(partial(self.map, observation), corners, cores)
+            for (row, column), core in zip(places, found, strict=True):
                 total[:, row : row + core.shape[1], column : column + core.shape[2]] = core
         return VarianceMap(*total)
 
@@ -174,9 +189,7 @@ def by_windows(
             slice(0 if first == 0 else HALOS[0], side if first + side == size else side - HALOS[0])
             for first, size in zip(corner, shape, strict=True)
         )
-        found, other = (
-            windows.map(each, corner)[(slice(None), *core)].mean(axis=(1, 2)) for each in (observation, like)
-        )
+        found, other = (windows.map(each, corner, core).mean(axis=(1, 2)) for each in (observation, like))
         ratios[:, row, column] = np.divide(found, other, out=np.ones(3), where=other > 0)
     middles = [each + side / 2 for each in starts]
     down, across = (_interpolation(size, middle) for size, middle in zip(shape, middles, strict=True))

@@ -129,7 +129,7 @@ class Prepared:
 class Execution:
     """Workers for parallel tasks (default: threads of this process), a callback for progress, and what frames share.
 
-    quick : True leaves out slow maps of a frame's error, where its mean alone is compared with that of another model
+    quick : True takes the fastest map of a frame's error, where its mean alone is compared with that of another model
     """
 
     workers: Workers | None = None

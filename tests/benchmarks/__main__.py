@@ -10,7 +10,7 @@ interrupted: `nasty`, half an hour, `pictures`, which measures error bars of ele
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from rich.console import Console
 from rich.table import Table
@@ -19,12 +19,12 @@ from .camera import camera_table
 from .cells import command as cells
 from .chain import command as chain
 from .coverage import command as coverage
-from .frames import frames_table
+from .frames import frames_tables
 from .nasty import command as nasty
 from .pictures import command as pictures
 
 NARROWEST = 160
-PARTS: dict[str, Callable[[], Table]] = {"rendering": camera_table, "frames": frames_table}
+PARTS: dict[str, Callable[[], Iterable[Table]]] = {"rendering": lambda: [camera_table()], "frames": frames_tables}
 ALONE: dict[str, Callable[[list[str]], None]] = {
     "cells": cells,
     "chain": chain,
@@ -49,7 +49,8 @@ def main() -> None:
     console = Console()
     console.width = max(console.width, NARROWEST)  # a pipe has 80 columns, which break every cell
     for name in names:
-        console.print(PARTS[name]())
+        for table in PARTS[name]():
+            console.print(table)
 
 
 if __name__ == "__main__":

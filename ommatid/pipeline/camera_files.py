@@ -122,8 +122,13 @@ def export_matrix(model: Path, output: Path) -> dict[str, int]:
 def _from_points(setup: Setup, output: Path, recording: PointRecording) -> tuple[Model, bool, list[str]]:
     check_output(output, *recording.files)
     outcome = from_recorded_points(setup, recording.images, recording.settings, recording.positions, recording.value)
-    model_file.write(output, outcome.model)
-    return outcome.model, True, calibration_warnings(outcome)
+    model = outcome.model
+    if setup.scene.calibration.fit != "none" and setup.camera.walls:
+        from ommatid.simulate.calibration.fit.recorded import fit_recorded
+
+        model = fit_recorded(model)
+    model_file.write(output, model)
+    return model, True, calibration_warnings(outcome)
 
 
 WORST_OFFSET = 0.1  # sensor pixels between a patch and the whole pixels cut out for it; beyond, the design's H misleads

@@ -67,6 +67,7 @@ class Purpose(IntEnum):
     KERNEL_ERRORS = 70
     GOAL = 71  # of a calibration
     GOAL_BOUND = 72
+    RECORDED_ERRORS = 73  # of entries of H from recorded points
     STABILITY_RECORDED = 80
     STABILITY_MATRICES = 81
 

@@ -13,6 +13,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.model import Model, fitted_model
 from ommatid.scenes.setup import Setup
@@ -94,7 +95,9 @@ def fits(setup: Setup) -> bool:
 
 
 def _compared(model: Model, camera: Camera, passes: int) -> dict[str, Any]:
-    """Compare H with the ideal one, if that has a closed form."""
+    """Compare H with the ideal one, if that has a closed form which takes less time than the calibration."""
+    if camera.has_surfaces and camera.unknowns > MOST_DENSE:
+        return {}
     bent = (lens for lens in camera.types if lens.optics.distortion is not None or lens.is_rotated)
     if not camera.walls or any(camera.is_blurred(lens) for lens in bent):
         return {}

@@ -7,10 +7,12 @@ shift, magnification and rotation fall as 1/n, as fast as with all pixels and mo
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -19,6 +21,7 @@ from ommatid.scenes.lens_type import LensType
 
 SIDE = 12  # most pixels of a chart along a side of a sub-imager
 SHARED = 650  # pixels of a chart that serve kernels, which all sub-imagers of a lens type share
+LEAST_LIGHT = 1e-9  # of a pixel's rays, below which it has no centroid
 BESIDE = 1  # pixels of f around what a pixel's rays meet, where a model may expect light too
 
 
@@ -64,22 +67,23 @@ class ChartRows:
 
     def centroids(self) -> tuple[FloatArray, FloatArray]:
         """Return the centroids of the rows, in rows and columns of f: (pixels,) each."""
-        return centroids(self.values, self.row, self.column)
+        nothing = np.zeros(self.row.size)
+        down, across = (along[0] for along in self._along(self.values[None], (nothing, nothing)))
+        return down, across
 
     def batch_centroids(self) -> tuple[FloatArray, FloatArray]:
-        """Return the deviations of the batches' centroids: (batches, pixels), in rows and columns of f."""
-        down, across = self.centroids()
-        each = [centroids(self.values + batch, self.row, self.column) for batch in self.batches]
-        return np.array([one[0] - down for one in each]), np.array([one[1] - across for one in each])
+        """Return the deviations of the batches' centroids to first order: (batches, pixels), rows and columns of f."""
+        down, across = self._along(self.batches, self.centroids())
+        return down, across
 
-
-def centroids(values: FloatArray, row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return the centroids of rows of H in windows: (pixels, W, V) to (pixels,) rows and columns of f."""
-    light = np.maximum(values.sum(axis=(1, 2)), np.finfo(float).tiny)
-    high, wide = (np.arange(size, dtype=np.float64) + 0.5 for size in values.shape[1:])
-    down = values.sum(axis=2) @ high / light
-    across = values.sum(axis=1) @ wide / light
-    return row + down, column + across
+    def _along(self, values: NDArray[np.floating], origin: Sequence[FloatArray]) -> Iterator[FloatArray]:
+        """Yield moments of rows, (n, pixels, W, V), about an origin, relative to the light: (n, pixels) by axis."""
+        light = np.maximum(self.light, LEAST_LIGHT)
+        for axis, first in enumerate((self.row, self.column)):
+            start: FloatArray = np.subtract(first, origin[axis]) + 0.5
+            places = start[:, None] + np.arange(self.values.shape[1 + axis], dtype=np.float64)
+            lines = np.asarray(values.sum(axis=3 - axis), dtype=np.float64)
+            yield np.einsum("bpx,px->bp", lines, places) / light
 
 
 def chart_rows(camera: Camera, lens_type: LensType, matrix: sparse.csr_array, batches: Float32Array) -> list[ChartRows]:

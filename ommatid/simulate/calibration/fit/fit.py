@@ -53,9 +53,12 @@ class Explanation:
         return float(stats.f.sf(self.left / self.expected, self.freedom, self.freedom * (self.batches - 1)))
 
 
-def explanation(chart: ChartRows, model: FloatArray, rays: int) -> Explanation:
-    """Compare measured rows with those of a model, (pixels, W, V). rays : per pixel, of all passes."""
-    weights = (rays / (model + FEW / rays)).ravel()
+def explanation(chart: ChartRows, model: FloatArray, rays: int, few: float = FEW) -> Explanation:
+    """Compare measured rows with those of a model, (pixels, W, V).
+
+    rays : per pixel, of all passes;  few : rays of a cell, below which its weight hardly grows
+    """
+    weights = (rays / (model + few / rays)).ravel()
     residual = (chart.values - model).ravel()
     batches = chart.batches.reshape(len(chart.batches), -1)
     gram = np.asarray((batches * weights) @ batches.T, dtype=np.float64)
@@ -103,19 +106,25 @@ def has_chart(camera: Camera, lens_type: LensType, with_kernels: bool = True) ->
 
 
 def calibrate_by_fit(
-    camera: Camera, measure: Measure, variances: Variances, rays: Rays, with_kernels: bool = True
+    camera: Camera,
+    measure: Measure,
+    variances: Variances,
+    rays: Rays,
+    with_kernels: bool = True,
+    few: float = FEW,
 ) -> FittedCalibration:
     """Measure a chart and fit it; then measure all pixels of what it does not explain.
 
     measure : yields the responses of some pixels of each lens type;  variances : of their entries
-    rays : per pixel of each lens type, of all passes;  with_kernels : True if kernels may explain blur
+    rays : per pixel of each lens type, of all passes;  few : as of `explanation`
+    with_kernels : True if kernels may explain blur
     """
     charted = {lens.name: has_chart(camera, lens, with_kernels) for lens in camera.types}
     charts = {lens.name: _chart(camera, lens) for lens in camera.types}
     subsets: Subsets = {name: chart if charted[name] else None for name, chart in charts.items()}
     responses = measure(subsets)
     fits = {
-        lens.name: _fit_type(camera, lens, subs, responses, rows, rays[lens.name], charted[lens.name])
+        lens.name: _fit_type(camera, lens, subs, responses, rows, (rays[lens.name], few), charted[lens.name])
         for lens, subs, rows in zip(camera.types, _by_type(camera), camera.type_slices(), strict=True)
     }
     charted = {lens.name: charted[lens.name] and charts[lens.name].size < lens.measurements for lens in camera.types}
@@ -154,9 +163,10 @@ def _fit_type(
     subs: list[SubImager],
     responses: Responses,
     rows: slice,
-    rays: int,
+    weights: tuple[int, float],
     charted: bool,
 ) -> _TypeFit:
+    """Fit the views or the kernels of a lens type; weights : rays and few, as of `explanation`."""
     if not charted:
         return _TypeFit(views_as_designed(subs, explained=False), None, [])
     if not is_sharp(camera, lens):
@@ -168,11 +178,11 @@ def _fit_type(
     batches = responses.batches[:, int(pointers[rows.start]) : int(pointers[rows.stop])]
     charts = chart_rows(camera, lens, responses.matrix[rows], batches)
     try:
-        fit = fit_views(camera, subs, charts, rays)
+        fit = fit_views(camera, subs, charts, weights[0])
     except InputError:  # rows that no view has led to a distortion that folds the image
         return _TypeFit(views_as_designed(subs, explained=False), None, [])
     models = [predicted(camera, sub, fit.numbers[n], charts[n]) for n, sub in enumerate(subs)]
-    explanations = [explanation(chart, model, rays) for chart, model in zip(charts, models, strict=True)]
+    explanations = [explanation(chart, model, *weights) for chart, model in zip(charts, models, strict=True)]
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(camera.sub_imagers))
     explained = np.array([each.chance >= single for each in explanations])
     numbers = np.where(explained[:, None], fit.numbers, designed_views(subs))

@@ -65,6 +65,11 @@ class ChartRows:
         """Share of a pixel's rays that meet the target: (pixels,)."""
         return self.values.sum(axis=(1, 2))
 
+    @property
+    def known(self) -> BoolArray:
+        """True for entries that were measured, (pixels, W, V), where each has noise."""
+        return (self.batches != 0).any(axis=0)
+
     def centroids(self) -> tuple[FloatArray, FloatArray]:
         """Return the centroids of the rows, in rows and columns of f: (pixels,) each."""
         nothing = np.zeros(self.row.size)

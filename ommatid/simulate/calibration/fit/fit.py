@@ -36,6 +36,7 @@ STRAY = 0.5  # rays that each cell may miss or have in excess, by rounding of po
 Measure = Callable[[Subsets], Responses]
 Variances = Callable[[Responses], FloatArray]
 Rays = dict[str, int]
+Weigh = Callable[[ChartRows, FloatArray, int], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,18 @@ class Explanation:
         return float(stats.f.sf(self.left / self.expected, self.freedom, self.freedom * (self.batches - 1)))
 
 
-def explanation(chart: ChartRows, model: FloatArray, rays: int, few: float = FEW) -> Explanation:
+def as_of_rays(chart: ChartRows, model: FloatArray, rays: int) -> FloatArray:
+    """Return the weights of entries that independent rays sample: (pixels, W, V)."""
+    del chart
+    return rays / (model + FEW / rays)
+
+
+def explanation(chart: ChartRows, model: FloatArray, rays: int, weigh: Weigh = as_of_rays) -> Explanation:
     """Compare measured rows with those of a model, (pixels, W, V).
 
-    rays : per pixel, of all passes;  few : rays of a cell, below which its weight hardly grows
+    rays : per pixel, of all passes;  weigh : yields the weights of the entries from these arguments
     """
-    weights = (rays / (model + few / rays)).ravel()
+    weights = weigh(chart, model, rays).ravel()
     residual = (chart.values - model).ravel()
     batches = chart.batches.reshape(len(chart.batches), -1)
     gram = np.asarray((batches * weights) @ batches.T, dtype=np.float64)
@@ -111,12 +118,12 @@ def calibrate_by_fit(
     variances: Variances,
     rays: Rays,
     with_kernels: bool = True,
-    few: float = FEW,
+    weigh: Weigh = as_of_rays,
 ) -> FittedCalibration:
     """Measure a chart and fit it; then measure all pixels of what it does not explain.
 
     measure : yields the responses of some pixels of each lens type;  variances : of their entries
-    rays : per pixel of each lens type, of all passes;  few : as of `explanation`
+    rays : per pixel of each lens type, of all passes;  weigh : as of `explanation`
     with_kernels : True if kernels may explain blur
     """
     charted = {lens.name: has_chart(camera, lens, with_kernels) for lens in camera.types}
@@ -124,7 +131,7 @@ def calibrate_by_fit(
     subsets: Subsets = {name: chart if charted[name] else None for name, chart in charts.items()}
     responses = measure(subsets)
     fits = {
-        lens.name: _fit_type(camera, lens, subs, responses, rows, (rays[lens.name], few), charted[lens.name])
+        lens.name: _fit_type(camera, lens, subs, responses, rows, (rays[lens.name], weigh), charted[lens.name])
         for lens, subs, rows in zip(camera.types, _by_type(camera), camera.type_slices(), strict=True)
     }
     charted = {lens.name: charted[lens.name] and charts[lens.name].size < lens.measurements for lens in camera.types}
@@ -163,10 +170,10 @@ def _fit_type(
     subs: list[SubImager],
     responses: Responses,
     rows: slice,
-    weights: tuple[int, float],
+    weights: tuple[int, Weigh],
     charted: bool,
 ) -> _TypeFit:
-    """Fit the views or the kernels of a lens type; weights : rays and few, as of `explanation`."""
+    """Fit the views or the kernels of a lens type; weights : rays and weigh, as of `explanation`."""
     if not charted:
         return _TypeFit(views_as_designed(subs, explained=False), None, [])
     if not is_sharp(camera, lens):
@@ -178,7 +185,7 @@ def _fit_type(
     batches = responses.batches[:, int(pointers[rows.start]) : int(pointers[rows.stop])]
     charts = chart_rows(camera, lens, responses.matrix[rows], batches)
     try:
-        fit = fit_views(camera, subs, charts, weights[0])
+        fit = fit_views(camera, subs, charts, weights[0], matched=weights[1] is not as_of_rays)
     except InputError:  # rows that no view has led to a distortion that folds the image
         return _TypeFit(views_as_designed(subs, explained=False), None, [])
     models = [predicted(camera, sub, fit.numbers[n], charts[n]) for n, sub in enumerate(subs)]

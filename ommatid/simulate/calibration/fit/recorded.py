@@ -11,12 +11,14 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.hardware.point_sources import UNKNOWN_VARIANCE
 from ommatid.scenes.model import Model, fitted_model, measured_rows
 
 from ...sampling.passes import BATCHES
 from ..point_sources import Responses
+from .chart import ChartRows
 from .fit import calibrate_by_fit, is_sharp
 
 RAYS = 2**20  # per pixel, of light that is not sampled by rays: what single ones would decide is far below any noise
@@ -34,13 +36,19 @@ def fit_recorded(model: Model) -> Model:
         lambda each: each.variance,
         {lens_type.name: RAYS for lens_type in camera.types},
         with_kernels=False,
-        few=RAYS,  # noise of the sensor is about the same for all entries
+        weigh=_alike,
     )
     if not fit.record["accepted"]:
         return model
     rest = measured_rows(replace(model, fitted=fit.matrix))
     found = {key: value for key, value in fit.record.items() if key != "chart"}  # all rows were measured
     return fitted_model(model.scene, camera, fit.matrix, rest, model.record | {"fit": found})
+
+
+def _alike(chart: ChartRows, model: FloatArray, rays: int) -> FloatArray:
+    """Return the weights of entries with about the same noise, 0 for those that were not recorded: (pixels, W, V)."""
+    del model, rays
+    return chart.known.astype(np.float64)
 
 
 def _responses(model: Model) -> Responses:

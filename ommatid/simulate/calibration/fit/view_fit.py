@@ -42,6 +42,7 @@ STEPS = 12  # of Gauss and Newton; 2 but where views are displaced by more than 
 SETTLED = 0.01  # of a ray's share of a centroid, below which another step changes nothing
 LEAST_LIGHT = 0.3  # of a pixel's rays that have to meet the target for its centroid to be used, and
 LOST = 0.02  # of them that may miss it where footprints are no boxes as designed
+MOVE = 0.05  # pixels of f, for derivatives of rows
 NEAR = 0.05  # pixels of f from the target's edge to that of a footprint, within which centroids move unevenly
 REDUCTIONS = (
     ((K1,), "designed"),
@@ -52,6 +53,7 @@ REDUCTIONS = (
     ((ROW, COLUMN), "designed"),
 )
 Structure = tuple[str, ...]  # of each number "own", "shared" or "designed"
+SHIFTS: Structure = ("own", "own", "designed", "designed", "designed")
 FREE: Structure = ("own", "own", "own", "own", "shared")  # distortion is the lens type's
 
 
@@ -172,33 +174,43 @@ class ViewSolution:
     freedom: int
 
 
-def fit_views(camera: Camera, subs: list[SubImager], charts: list[ChartRows], rays: int) -> ViewFit:
-    """Fit the views of a lens type's sub-imagers. rays : per pixel, of all passes."""
+def fit_views(
+    camera: Camera, subs: list[SubImager], charts: list[ChartRows], rays: int, *, matched: bool = False
+) -> ViewFit:
+    """Fit the views of a lens type's sub-imagers.
+
+    rays : per pixel, of all passes;  matched : as of `_centroids`, where entries without light are noisy, too
+    """
     start = np.array([designed(sub) for sub in subs])
     smallest = np.min([scales(camera, sub) for sub in subs], axis=0)
     units = np.tile(smallest, (len(subs), 1))  # the same for all, who may share numbers
 
-    def problems_at(numbers: FloatArray) -> list[Centroids]:
+    def problems_at(numbers: FloatArray, matched: bool) -> list[Centroids]:
+        moved = (numbers - start) / units
         return _shrunk(
             [
-                _centroids(camera, sub, numbers[n], charts[n], units[n], rays, (numbers[n] - start[n]) / units[n])
+                _centroids(camera, sub, numbers[n], charts[n], units[n], rays, moved[n], matched=matched)
                 for n, sub in enumerate(subs)
             ]
         )
 
-    def iterated(numbers: FloatArray, structure: Structure) -> tuple[FloatArray, list[Centroids], ViewSolution]:
-        problems = problems_at(numbers)
+    def iterated(
+        numbers: FloatArray, structure: Structure, matched: bool
+    ) -> tuple[FloatArray, list[Centroids], ViewSolution]:
+        problems = problems_at(numbers, matched)
         for _ in range(STEPS):
             solution = solve(problems, structure)
             before, numbers = numbers, start + solution.numbers * units
             if np.abs((numbers - before) / units).max(initial=0.0) < SETTLED / rays:
                 break
-            problems = problems_at(numbers)
+            problems = problems_at(numbers, matched)
         return numbers, problems, solve(problems, structure)
 
-    numbers, problems, _ = iterated(start, FREE)
+    # Of views that are far from the design, pixels at the target's edge would pass for other numbers.
+    numbers, _, _ = iterated(start, SHIFTS, False)
+    numbers, problems, _ = iterated(numbers, FREE, matched)
     structure, chances = _structure(problems)
-    numbers, problems, solution = iterated(numbers, structure)
+    numbers, problems, solution = iterated(numbers, structure, matched)
     doubtful = _errors_of_design(problems, structure, solution)
     return ViewFit(numbers, doubtful[0] * units[:, :, None], doubtful[1] * units[:, :, None], structure, chances)
 
@@ -253,26 +265,57 @@ def _centroids(
     units: FloatArray,
     rays: int,
     from_design: FloatArray,
+    *,
+    matched: bool,
 ) -> Centroids:
-    """Return the moves of the centroids from the design, linear around these numbers."""
+    """Return the moves of the centroids from the design, linear around these numbers.
+
+    matched : True takes the moves that explain a row's entries best, which noise far from its light does not disturb
+    """
     light, expected = _expected(camera, sub, numbers, chart)
     boxes, (starts, width) = _designed_boxes(sub), _intervals(camera, sub, numbers, chart)
     least = LEAST_LIGHT if boxes else 1 - LOST
     kept, slopes = (light > least) & (chart.light > least), np.ones((2, light.size))
     for slope, start, size in zip(slopes, starts, camera.shape, strict=True):
         for beyond in (-start, start + width - size) if boxes else ():
-            slope[beyond > 0] -= 0.5  # of a box that the target's edge cuts the other end alone moves
+            slope[beyond > 0] -= 0.0 if matched else 0.5  # of a box that the edge cuts the other end alone moves
             kept &= np.abs(beyond) > NEAR
-    measured, scatter = chart.centroids(), chart.batch_centroids()
+    if matched:
+        moves, scatter = _matched_moves(camera, sub, numbers, chart)
+    else:
+        moves = [one - other for one, other in zip(chart.centroids(), expected, strict=True)]
+        scatter = chart.batch_centroids()
     design = np.concatenate(displacements(camera, sub, (chart.down, chart.across))) * units
     design *= slopes.ravel()[:, None]
     both = np.tile(kept, 2)
-    moved = np.concatenate([one - other for one, other in zip(measured, expected, strict=True)]) + design @ from_design
+    moved = np.concatenate(moves) + design @ from_design
     count = len(scatter[0])
     variance = np.square(np.concatenate(scatter, axis=1)).sum(axis=0) / (count * (count - 1))
     # A view that moves by less than m / 2 rays of all its pixels together moves none of them across an edge.
     unseen = (float(sub.type.ratio) / (2 * rays)) ** 2 / max(kept.sum(), 1)
     return Centroids(design[both], moved[both], variance[both], unseen)
+
+
+def _matched_moves(
+    camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
+    """Return by how much rows lie beside those of the numbers, (2, pixels), and the deviations of the batches.
+
+    By least squares over the entries that were measured.
+    """
+    slopes: list[FloatArray] = []
+    for number in (ROW, COLUMN):
+        step = np.zeros(COUNT)
+        step[number] = MOVE
+        ahead, behind = (predicted(camera, sub, numbers + sign * step, chart) for sign in (1, -1))
+        slopes.append((ahead - behind) / (2 * MOVE) * chart.known)
+    along = np.stack(slopes).reshape(2, chart.row.size, -1)
+    inverse: FloatArray = np.linalg.pinv(np.einsum("ipc,jpc->pij", along, along))
+    gain: FloatArray = np.einsum("pij,jpc->ipc", inverse, along)
+    residual = (chart.values - predicted(camera, sub, numbers, chart)).reshape(chart.row.size, -1)
+    batches = chart.batches.reshape(len(chart.batches), chart.row.size, -1)
+    down, across = np.einsum("ipc,bpc->ibp", gain, batches)
+    return np.einsum("ipc,pc->ip", gain, residual), (down, across)
 
 
 def solve(problems: list[Centroids], structure: Structure) -> ViewSolution:

@@ -43,6 +43,7 @@ SETTLED = 0.01  # of a ray's share of a centroid, below which another step chang
 LEAST_LIGHT = 0.3  # of a pixel's rays that have to meet the target for its centroid to be used, and
 LOST = 0.02  # of them that may miss it where footprints are no boxes as designed
 MOVE = 0.05  # pixels of f, for derivatives of rows
+DARK = 1e-9  # added to the squares of these derivatives, which are 0 for a pixel without light
 NEAR = 0.05  # pixels of f from the target's edge to that of a footprint, within which centroids move unevenly
 REDUCTIONS = (
     ((K1,), "designed"),
@@ -310,8 +311,8 @@ def _matched_moves(
         ahead, behind = (predicted(camera, sub, numbers + sign * step, chart) for sign in (1, -1))
         slopes.append((ahead - behind) / (2 * MOVE) * chart.known)
     along = np.stack(slopes).reshape(2, chart.row.size, -1)
-    inverse: FloatArray = np.linalg.pinv(np.einsum("ipc,jpc->pij", along, along))
-    gain: FloatArray = np.einsum("pij,jpc->ipc", inverse, along)
+    squares: FloatArray = np.einsum("ipc,jpc->pij", along, along) + DARK * np.eye(2)
+    gain = np.einsum("pij,jpc->ipc", np.linalg.inv(squares), along)
     residual = (chart.values - predicted(camera, sub, numbers, chart)).reshape(chart.row.size, -1)
     batches = chart.batches.reshape(len(chart.batches), chart.row.size, -1)
     down, across = np.einsum("ipc,bpc->ibp", gain, batches)

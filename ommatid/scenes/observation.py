@@ -8,12 +8,13 @@ transform of the image.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from math import gcd
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from .camera import Camera
 
 ComplexArray = NDArray[np.complex128]
+Value = TypeVar("Value")
 EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
 
 
@@ -49,8 +51,18 @@ class Back:
 
     def __init__(self, shape: tuple[int, int], padded: tuple[int, int]) -> None:
         """Begin with 0."""
-        self.image, self.padded = np.zeros(shape), padded
+        self.shape, self.padded = shape, padded
         self._spectrum: ComplexArray | None = None
+
+    @cached_property
+    def image(self) -> FloatArray:
+        """The sum of what is added in pixels: (rows, columns)."""
+        return np.zeros(self.shape)
+
+    def add(self, other: Back) -> None:
+        """Add another sum of Fourier coefficients alone."""
+        if other._spectrum is not None:
+            self.add_spectrum(other._spectrum)
 
     def add_spectrum(self, spectrum: ComplexArray) -> None:
         """Add the coefficients of an image on the padded grid."""
@@ -96,6 +108,11 @@ class ObservationPart(ABC):
     def spacing(self) -> int:
         """Pixels of f between neighbouring readings along an axis, a common factor of which divides the padded grid."""
         return 1
+
+    @property
+    def is_slow(self) -> bool:
+        """True if it takes many transforms of its own, and adds nothing but coefficients to a sum."""
+        return False
 
     @abstractmethod
     def forward(self, seen: Seen, out: FloatArray) -> None:
@@ -250,16 +267,31 @@ class Observation:
         """Return H f: (N,) or (rows, columns) to (M,)."""
         grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.shape)
         seen, out = Seen(grid, self._padded), np.empty(self.measurements)
-        for part, place in zip(self.parts, self.slices, strict=True):
-            part.forward(seen, out[place])
+        for _ in self._each(lambda part, place: part.forward(seen, out[place])):
+            pass
         return out
 
     def adjoint(self, measurements: FloatArray) -> FloatArray:
         """Return H^T g: (M,) to (N,)."""
-        readings, back = np.ascontiguousarray(measurements, dtype=np.float64), Back(self.shape, self._padded)
-        for part, place in zip(self.parts, self.slices, strict=True):
+        readings, total = np.ascontiguousarray(measurements, dtype=np.float64), Back(self.shape, self._padded)
+
+        def spread(part: ObservationPart, place: slice) -> Back:
+            back = Back(self.shape, self._padded) if part.is_slow else total
             part.adjoint(readings[place], back)
-        return back.total.ravel()
+            return back
+
+        for back in self._each(spread):
+            if back is not total:
+                total.add(back)
+        return total.total.ravel()
+
+    def _each(self, work: Callable[[ObservationPart, slice], Value]) -> Iterator[Value]:
+        """Yield the results of the parts, in their order; slow ones are computed side by side."""
+        if len(self.parts) == 1 or not all(part.is_slow for part in self.parts):
+            yield from map(work, self.parts, self.slices)
+            return
+        with ThreadPoolExecutor(processors()) as threads:
+            yield from threads.map(work, self.parts, self.slices)
 
     def coarser(self, camera: Camera, detail: int) -> Observation:
         """Return H of images of `detail` times larger pixels, each of which is made of equal ones.

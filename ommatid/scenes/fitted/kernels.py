@@ -174,17 +174,34 @@ class _Grid:
             lines /= every**2
         return np.asarray(fft.irfft(lines, length, workers=processors(), overwrite_x=True))[self._places]
 
-    def spectrum_of(self, readings: FloatArray, weight: FloatArray | float) -> ComplexArray:
-        """Return the spectrum, (rows, columns / 2 + 1), of weighted readings, (sensor rows, sensor columns)."""
+    @cached_property
+    def _repeats(self) -> list[tuple[slice, slice]]:
+        """Rows and columns of the padded grid's coefficients, in blocks that repeat those of the folded grid."""
+        (down, across), columns = self._folded, self.padded[1] // 2 + 1
+        return [
+            (slice(row, row + down), slice(column, min(column + across, columns)))
+            for row in range(0, self.padded[0], down)
+            for column in range(0, columns, across)
+        ]
+
+    def add_spread(self, total: ComplexArray, readings: FloatArray, weight: FloatArray | float, number: int) -> None:
+        """Add to the conjugate spectrum of an image that of weighted readings, spread by kernel `number`.
+
+        total : (rows, columns / 2 + 1);  readings : (sensor rows, sensor columns)
+        """
         placed = np.zeros(self._folded)
         if isinstance(self._places[0], slice):
             np.multiply(readings, weight, out=placed[self._places])
         else:
             np.add.at(placed, self._places, weight * readings)  # several may begin at one pixel
-        if self.every == 1:
-            return np.asarray(fft.rfft2(placed, workers=processors(), overwrite_x=True))
-        whole = np.asarray(fft.fft2(placed, workers=processors(), overwrite_x=True))
-        return np.tile(whole, (self.every, self.every // 2 + 1))[:, : self.padded[1] // 2 + 1]
+        transform = fft.rfft2 if self.every == 1 else fft.fft2
+        spectrum = np.asarray(transform(placed, workers=processors(), overwrite_x=True))
+        np.conj(spectrum, out=spectrum)
+        room = np.empty_like(spectrum)
+        for block in self._repeats:
+            width = block[1].stop - block[1].start
+            product = np.multiply(self.transfers[number][block], spectrum[:, :width], out=room[:, :width])
+            total[block] += product
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,14 +272,10 @@ class KernelFootprints(ObservationPart):
         """Add H^T g to `back`; readings : (measurements of the type,)."""
         grid, ordered = self._grid(back.padded), np.empty(self.places.sensor)
         ordered.ravel()[self.places.order] = readings
-        total: ComplexArray | None = None
-        for transfer, weight in zip(grid.transfers, self._applied_weights, strict=True):
-            spectrum = grid.spectrum_of(ordered, weight)
-            np.conj(spectrum, out=spectrum)
-            spectrum *= transfer
-            total = spectrum if total is None else np.add(total, spectrum, out=total)
-        if total is not None:
-            back.add_spectrum(np.conj(total, out=total))
+        total = np.zeros((back.padded[0], back.padded[1] // 2 + 1), dtype=np.complex128)
+        for number, weight in enumerate(self._applied_weights):
+            grid.add_spread(total, ordered, weight, number)
+        back.add_spectrum(np.conj(total, out=total))
 
     def _grid(self, padded: tuple[int, int]) -> _Grid:
         """Return what a padded grid needs, which is computed once."""
@@ -306,6 +319,11 @@ class KernelFootprints(ObservationPart):
             placed[np.ix_(first % padded[0], beside % padded[1])] = kernel
             spectrum = np.asarray(fft.rfft2(placed, workers=processors(), overwrite_x=True))
             yield np.conj(spectrum, out=spectrum)
+
+    @property
+    def is_slow(self) -> bool:
+        """True if the kernels vary over the field."""
+        return self.degree > 0
 
     @property
     def spacing(self) -> int:

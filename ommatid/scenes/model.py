@@ -314,11 +314,20 @@ def fitted_model(
         count = 0 if entries is None else int(entries.nnz)
         return Model(scene, camera, entries, np.zeros(count), np.zeros((0, count), np.float32), record, fitted=fitted)
     explained = fitted.to_sparse()
-    matrix = sparse.csr_array(explained + rest.matrix)
+    matrix = _merged(explained, rest.matrix)
     rows = np.repeat(np.diff(rest.matrix.indptr) > 0, np.diff(matrix.indptr))  # stored in rows that were measured
     variance, batches = np.zeros(matrix.nnz), np.zeros((len(rest.batches), matrix.nnz), np.float32)
     variance[rows], batches[:, rows] = rest.variance, rest.batches
     return Model(scene, camera, matrix, variance, batches, record, fitted=fitted)
+
+
+def _merged(first: sparse.csr_array, second: sparse.csr_array) -> sparse.csr_array:
+    """Return the rows of two matrices, each of which is empty in one of them; entries of value 0 stay."""
+    parts = first, second
+    rows = np.concatenate([np.repeat(np.arange(part.shape[0]), np.diff(part.indptr)) for part in parts])
+    order = np.argsort(rows, kind="stable")
+    data, indices = (np.concatenate([getattr(part, name) for part in parts])[order] for name in ("data", "indices"))
+    return sparse.csr_array((data, indices, first.indptr + second.indptr), shape=first.shape)
 
 
 def measured_rows(model: Model) -> MeasuredRows | None:

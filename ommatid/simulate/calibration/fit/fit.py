@@ -50,7 +50,9 @@ class Explanation:
 
     @property
     def chance(self) -> float:
-        """Probability of a sum of squares at least as large if the model is correct."""
+        """Probability of a sum of squares at least as large if the model is correct; 0 where nothing was measured."""
+        if not self.expected:
+            return 0.0
         return float(stats.f.sf(self.left / self.expected, self.freedom, self.freedom * (self.batches - 1)))
 
 

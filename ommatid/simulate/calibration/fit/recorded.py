@@ -21,13 +21,16 @@ from ..point_sources import Responses
 from .chart import ChartRows
 from .fit import calibrate_by_fit, is_sharp
 
-RAYS = 2**20  # per pixel, of light that is not sampled by rays: what single ones would decide is far below any noise
+RAYS = 2**14  # per pixel, of light that is not sampled by rays: what single ones would decide is far below any noise
 
 
 def fit_recorded(model: Model) -> Model:
-    """Return the model with views wherever they explain the recorded entries of H; itself where they do nowhere."""
+    """Return the model with views wherever they explain the recorded entries of H; itself where they do nowhere.
+
+    Entries without noise need no views.
+    """
     camera = model.camera
-    if not any(is_sharp(camera, lens_type) for lens_type in camera.types):
+    if not (model.variance > 0).all() or not any(is_sharp(camera, lens_type) for lens_type in camera.types):
         return model
     responses = _responses(model)
     fit = calibrate_by_fit(

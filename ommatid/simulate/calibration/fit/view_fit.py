@@ -310,11 +310,12 @@ def _matched_moves(
         step[number] = MOVE
         ahead, behind = (predicted(camera, sub, numbers + sign * step, chart) for sign in (1, -1))
         slopes.append((ahead - behind) / (2 * MOVE) * chart.known)
-    along = np.stack(slopes).reshape(2, chart.row.size, -1)
+    cells = chart.values.shape[1] * chart.values.shape[2]
+    along = np.stack(slopes).reshape(2, -1, cells)
     squares: FloatArray = np.einsum("ipc,jpc->pij", along, along) + DARK * np.eye(2)
     gain = np.einsum("pij,jpc->ipc", np.linalg.inv(squares), along)
-    residual = (chart.values - predicted(camera, sub, numbers, chart)).reshape(chart.row.size, -1)
-    batches = chart.batches.reshape(len(chart.batches), chart.row.size, -1)
+    residual = (chart.values - predicted(camera, sub, numbers, chart)).reshape(-1, cells)
+    batches = chart.batches.reshape(len(chart.batches), -1, cells)
     down, across = np.einsum("ipc,bpc->ibp", gain, batches)
     return np.einsum("ipc,pc->ip", gain, residual), (down, across)
 

@@ -124,9 +124,8 @@ def dense_or_sparse(matrix: sparse.csr_array) -> FloatArray | sparse.csr_array:
     return matrix.toarray() if is_dense(matrix) else matrix
 
 
-def information(matrix: sparse.csr_array, weights: FloatArray) -> FloatArray:
-    """Return H^T diag(w) H of few pixels: (N, N)."""
-    applied = dense_or_sparse(matrix)
+def information(applied: FloatArray | sparse.csr_array, weights: FloatArray) -> FloatArray:
+    """Return H^T diag(w) H of few pixels, (N, N), from H by `dense_or_sparse`."""
     if isinstance(applied, np.ndarray):
         return np.asarray(applied.T @ (applied * weights[:, None]), dtype=np.float64)
     return np.asarray((applied.T @ sparse.csr_array(applied.multiply(weights[:, None]))).toarray(), dtype=np.float64)
@@ -151,7 +150,7 @@ class SmallFrame:
     @cached_property
     def _parts(self) -> list[FloatArray]:
         """H^T H of each lens type where the unknowns are f's pixels: (N, N)."""
-        return [information(matrix, np.ones(matrix.shape[0])) for matrix in self.matrices]
+        return [information(dense_or_sparse(matrix), np.ones(matrix.shape[0])) for matrix in self.matrices]
 
     @cached_property
     def _precision(self) -> FloatArray:

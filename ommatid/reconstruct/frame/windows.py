@@ -85,12 +85,13 @@ class Windows:
         if isinstance(self._prior, float) and is_narrow(task):
             ratios, reach = actual / expected, min(observation.reach, max(shape))
             return swept_maps(matrix, 1 / expected, ratios, self._prior, shape, reach)[:, *core]
-        precision = information(matrix, 1 / expected) + self._precision
+        applied = dense_or_sparse(matrix)
+        precision = information(applied, 1 / expected) + self._precision
         covariance, missing = columns_of_covariance(precision, 1 / self._spectrum, shape, kept.ravel())
         posterior = covariance[kept.ravel(), np.arange(kept.size)]
         noisy = posterior - missing
         if not np.allclose(actual, expected, rtol=1e-9):
-            noisy = (actual / expected**2) @ np.square(dense_or_sparse(matrix) @ covariance)
+            noisy = (actual / expected**2) @ np.square(applied @ covariance)
         return np.array([posterior, missing, noisy]).reshape(3, *kept.shape)
 
     def frame(self, observation: Observation) -> VarianceMap:

@@ -36,7 +36,6 @@ STRAY = 0.5  # rays that each cell may miss or have in excess, by rounding of po
 Measure = Callable[[Subsets], Responses]
 Variances = Callable[[Responses], FloatArray]
 Rays = dict[str, int]
-Weigh = Callable[[ChartRows, FloatArray, int], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -56,18 +55,12 @@ class Explanation:
         return float(stats.f.sf(self.left / self.expected, self.freedom, self.freedom * (self.batches - 1)))
 
 
-def as_of_rays(chart: ChartRows, model: FloatArray, rays: int) -> FloatArray:
-    """Return the weights of entries that independent rays sample: (pixels, W, V)."""
-    del chart
-    return rays / (model + FEW / rays)
-
-
-def explanation(chart: ChartRows, model: FloatArray, rays: int, weigh: Weigh = as_of_rays) -> Explanation:
+def explanation(chart: ChartRows, model: FloatArray, rays: int, recorded: bool = False) -> Explanation:
     """Compare measured rows with those of a model, (pixels, W, V).
 
-    rays : per pixel, of all passes;  weigh : yields the weights of the entries from these arguments
+    rays : per pixel, of all passes;  recorded : True for entries with about the same noise, of which some are missing
     """
-    weights = weigh(chart, model, rays).ravel()
+    weights = (chart.known.astype(np.float64) if recorded else rays / (model + FEW / rays)).ravel()
     residual = (chart.values - model).ravel()
     batches = chart.batches.reshape(len(chart.batches), -1)
     gram = np.asarray((batches * weights) @ batches.T, dtype=np.float64)
@@ -120,12 +113,12 @@ def calibrate_by_fit(
     variances: Variances,
     rays: Rays,
     with_kernels: bool = True,
-    weigh: Weigh = as_of_rays,
+    recorded: bool = False,
 ) -> FittedCalibration:
     """Measure a chart and fit it; then measure all pixels of what it does not explain.
 
     measure : yields the responses of some pixels of each lens type;  variances : of their entries
-    rays : per pixel of each lens type, of all passes;  weigh : as of `explanation`
+    rays : per pixel of each lens type, of all passes;  recorded : as of `explanation`
     with_kernels : True if kernels may explain blur
     """
     charted = {lens.name: has_chart(camera, lens, with_kernels) for lens in camera.types}
@@ -133,7 +126,7 @@ def calibrate_by_fit(
     subsets: Subsets = {name: chart if charted[name] else None for name, chart in charts.items()}
     responses = measure(subsets)
     fits = {
-        lens.name: _fit_type(camera, lens, subs, responses, rows, (rays[lens.name], weigh), charted[lens.name])
+        lens.name: _fit_type(camera, lens, subs, responses, rows, rays[lens.name], charted[lens.name], recorded)
         for lens, subs, rows in zip(camera.types, _by_type(camera), camera.type_slices(), strict=True)
     }
     charted = {lens.name: charted[lens.name] and charts[lens.name].size < lens.measurements for lens in camera.types}
@@ -172,10 +165,10 @@ def _fit_type(
     subs: list[SubImager],
     responses: Responses,
     rows: slice,
-    weights: tuple[int, Weigh],
+    rays: int,
     charted: bool,
+    recorded: bool,
 ) -> _TypeFit:
-    """Fit the views or the kernels of a lens type; weights : rays and weigh, as of `explanation`."""
     if not charted:
         return _TypeFit(views_as_designed(subs, explained=False), None, [])
     if not is_sharp(camera, lens):
@@ -187,11 +180,11 @@ def _fit_type(
     batches = responses.batches[:, int(pointers[rows.start]) : int(pointers[rows.stop])]
     charts = chart_rows(camera, lens, responses.matrix[rows], batches)
     try:
-        fit = fit_views(camera, subs, charts, weights[0], matched=weights[1] is not as_of_rays)
+        fit = fit_views(camera, subs, charts, rays, matched=recorded)
     except InputError:  # rows that no view has led to a distortion that folds the image
         return _TypeFit(views_as_designed(subs, explained=False), None, [])
     models = [predicted(camera, sub, fit.numbers[n], charts[n]) for n, sub in enumerate(subs)]
-    explanations = [explanation(chart, model, *weights) for chart, model in zip(charts, models, strict=True)]
+    explanations = [explanation(chart, model, rays, recorded) for chart, model in zip(charts, models, strict=True)]
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(camera.sub_imagers))
     explained = np.array([each.chance >= single for each in explanations])
     numbers = np.where(explained[:, None], fit.numbers, designed_views(subs))

@@ -11,16 +11,14 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.hardware.point_sources import UNKNOWN_VARIANCE
 from ommatid.scenes.model import Model, fitted_model, measured_rows
 
-from ...sampling.passes import BATCHES
 from ..point_sources import Responses
-from .chart import ChartRows
 from .fit import calibrate_by_fit, is_sharp
 
+DRAWS = 32  # of errors: with few, the F test refuses more than its significance says
 RAYS = 2**14  # per pixel, of light that is not sampled by rays: what single ones would decide is far below any noise
 
 
@@ -39,19 +37,13 @@ def fit_recorded(model: Model) -> Model:
         lambda each: each.variance,
         {lens_type.name: RAYS for lens_type in camera.types},
         with_kernels=False,
-        weigh=_alike,
+        recorded=True,
     )
     if not fit.record["accepted"]:
         return model
     rest = measured_rows(replace(model, fitted=fit.matrix))
     found = {key: value for key, value in fit.record.items() if key != "chart"}  # all rows were measured
     return fitted_model(model.scene, camera, fit.matrix, rest, model.record | {"fit": found})
-
-
-def _alike(chart: ChartRows, model: FloatArray, rays: int) -> FloatArray:
-    """Return the weights of entries with about the same noise, 0 for those that were not recorded: (pixels, W, V)."""
-    del model, rays
-    return chart.known.astype(np.float64)
 
 
 def _responses(model: Model) -> Responses:
@@ -62,10 +54,10 @@ def _responses(model: Model) -> Responses:
     unknown = np.bincount(rows, model.variance >= UNKNOWN_VARIANCE, model.measurements) > 0
     kept = ~unknown[rows]
     rng = probe(Purpose.RECORDED_ERRORS)
-    errors = rng.normal(size=(BATCHES, matrix.nnz)) * np.sqrt(model.variance)
+    errors = rng.normal(size=(DRAWS, matrix.nnz)) * np.sqrt(model.variance)
     for shared in model.batches:
-        errors += rng.normal(size=(BATCHES, model.measurements))[:, rows] * shared
-    errors = BATCHES**0.5 * (errors - errors.mean(axis=0))
+        errors += rng.normal(size=(DRAWS, model.measurements))[:, rows] * shared
+    errors = DRAWS**0.5 * (errors - errors.mean(axis=0))
     starts = np.concatenate([[0], np.cumsum(np.where(unknown, 0, lengths))])
     measured = sparse.csr_array((matrix.data[kept], matrix.indices[kept], starts), shape=matrix.shape)
-    return Responses(BATCHES, 1, "", 0, measured, model.variance[kept], errors[:, kept].astype(np.float32))
+    return Responses(DRAWS, 1, "", 0, measured, model.variance[kept], errors[:, kept].astype(np.float32))

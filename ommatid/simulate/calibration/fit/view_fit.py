@@ -33,7 +33,6 @@ from ommatid.scenes.fitted.view import (
 from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.shrinkage import shrink_variances
 
-from ...sampling.passes import BATCHES
 from .chart import ChartRows
 
 STRAIGHT = 1e-4  # rad, and relative of k1: below, footprints are boxes to within 0.1 ray of 1024
@@ -153,13 +152,14 @@ class Centroids:
     """The linear problem of one sub-imager: moves of its centroids, rows first and then columns of f.
 
     design : (2 pixels, 5) per unit of each number, in `scales`;  moved : (2 pixels,) from the design
-    variance : (2 pixels,) of these;  unseen : variance that no ray shows
+    variance : (2 pixels,) of these, from so many `batches`;  unseen : variance that no ray shows
     """
 
     design: FloatArray
     moved: FloatArray
     variance: FloatArray
     unseen: float
+    batches: int
 
 
 @dataclass(frozen=True)
@@ -252,8 +252,8 @@ def _column(count: int, number: int, deviation: float) -> FloatArray:
 
 
 def _shrunk(problems: list[Centroids]) -> list[Centroids]:
-    """Return the problems with variances that eight batches alone would leave too uncertain for tests."""
-    variances = shrink_variances(np.concatenate([problem.variance for problem in problems]), BATCHES)
+    """Return the problems with variances that their batches alone would leave too uncertain for tests."""
+    variances = shrink_variances(np.concatenate([problem.variance for problem in problems]), problems[0].batches)
     parts = np.split(variances, np.cumsum([problem.variance.size for problem in problems])[:-1])
     return [replace(problem, variance=part + problem.unseen) for problem, part in zip(problems, parts, strict=True)]
 
@@ -294,7 +294,7 @@ def _centroids(
     variance = np.square(np.concatenate(scatter, axis=1)).sum(axis=0) / (count * (count - 1))
     # A view that moves by less than m / 2 rays of all its pixels together moves none of them across an edge.
     unseen = (float(sub.type.ratio) / (2 * rays)) ** 2 / max(kept.sum(), 1)
-    return Centroids(design[both], moved[both], variance[both], unseen)
+    return Centroids(design[both], moved[both], variance[both], unseen, count)
 
 
 def _matched_moves(
@@ -342,7 +342,7 @@ def solve(problems: list[Centroids], structure: Structure) -> ViewSolution:
         errors[n][own] = _root(each.covariance)
         common_errors[n][shared] = root
         common_errors[n][own] = -each.link @ root
-    freedom = (BATCHES - 1) * max(sum(problem.moved.size for problem in problems), 1)
+    freedom = (problems[0].batches - 1) * max(sum(problem.moved.size for problem in problems), 1)
     return ViewSolution(numbers, errors, common_errors, freedom)
 
 

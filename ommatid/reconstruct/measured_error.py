@@ -28,7 +28,7 @@ SHARPNESS = -0.5  # Keys's a, with which quadratic pictures are interpolated exa
 
 @dataclass(frozen=True)
 class MeasuredError:
-    """An estimate against the truth; None where the image is too small for the measure, or the error is zero."""
+    """An estimate against the truth; None where the image is too small or too large for the measure, or equal to it."""
 
     mse: float
     trimmed_mse: float | None
@@ -52,7 +52,11 @@ def measure_error(estimate: FloatArray, truth: FloatArray, shape: tuple[int, int
         from skimage import metrics
 
         similarity = cast(Any, metrics).structural_similarity
-        ssim = float(similarity(truth.reshape(shape), estimate.reshape(shape), data_range=WHITE))
+        # It holds ten maps of the image, which in float32 are half as large, and right to six digits.
+        images = (np.asarray(image, dtype=np.float32).reshape(shape) for image in (truth, estimate))
+        with np.errstate(over="ignore", invalid="ignore"):  # from values of 1e9 on
+            value = float(similarity(*images, data_range=WHITE))
+        ssim = value if np.isfinite(value) else None
     return MeasuredError(mse, trimmed_mean(squared, shape), psnr, ssim)
 
 

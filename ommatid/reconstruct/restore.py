@@ -143,7 +143,9 @@ def _spread(stack: Stack, assumed: Assumptions, total: FloatArray) -> FloatArray
     if not assumed.noise["rendering"].any():
         return uniform(0.0, total.size)
     share = np.divide(assumed.noise["rendering"], total, out=np.zeros(total.size), where=total > 0)
-    return np.square(share) * 2 / (freedoms - 4)
+    np.square(share, out=share)
+    share *= 2 / (freedoms - 4)
+    return share
 
 
 def _largest_ratio(total: FloatArray, expected: FloatArray) -> float:

@@ -30,7 +30,7 @@ from ommatid.scenes.stack import STRAIGHT, Stack, stack_from_recording
 from ommatid.scenes.tables.sensor import SensorTable
 
 from .renderer.renderer import Renderer
-from .renderer.variant import choose
+from .renderer.variant import choose, release
 from .sampling.checkpoint import Checkpoint, State, open_checkpoint
 from .sampling.passes import OverPasses, Plan, Tally, plan, rounding_variance
 from .world_view import rendered_world
@@ -143,6 +143,7 @@ def render(
         rendering = render_until(setup, progress, checkpoint)
     else:
         rendering = light(setup, progress, checkpoint)
+    release()  # some hundred bytes per reading of a large frame, while it is reconstructed
     record: dict[str, Any] = {
         "fingerprint": made_from(setup),
         "truth": digest((setup.image if truth is None else truth).astype(np.float32)),

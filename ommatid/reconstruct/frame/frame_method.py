@@ -30,7 +30,6 @@ from ..methods.method import (
     PosteriorOperators,
     is_uniform,
     residual_multipliers,
-    total_variance,
 )
 from ..output.run_json import SolverReport
 from ..prior import coloured
@@ -112,14 +111,9 @@ class FrameMethod(Method):
         """The solution f^ - f0."""
         task = self.task
         recorded = task.recorded if task.complete else np.where(task.used, task.recorded, 0.0)
-        conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=np.ones(0))
-        mean, _ = self.shared("mean", conditions, self._readings_of_mean)
-        right = self.system.right_hand_side(recorded - mean)
+        mean = self.system.observation.forward(np.full(task.model.unknowns, task.prior.mean))
+        right = self.system.right_hand_side(np.subtract(recorded, mean, out=mean))
         return self.system.solve(right, task.settings.accuracy, lambda done: self.execution.progress(SOLVING * done))
-
-    def _readings_of_mean(self) -> FloatArray:
-        """Return H f0: (M,)."""
-        return self.system.observation.forward(np.full(self.task.model.unknowns, self.task.prior.mean))
 
     def estimate_image(self) -> FloatArray:
         """Compute f^ without its error: (N,)."""
@@ -136,7 +130,7 @@ class FrameMethod(Method):
 
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
-        task, actual = self.task, total_variance(noise)
+        task, actual = self.task, self.actual_noise(noise)
         solution = self.solution
         make = partial(self._frame_error, noise, actual)
         errors, difference = self.shared(ERRORS, self.conditions(noise), make, SAME_NOISE)
@@ -225,14 +219,17 @@ class FrameMethod(Method):
         inputs = ResidualInputs(lambda image: image, task.draw_deviation, actual, mean, draws, leverage, total=total)
         columns = inputs.columns()
         of_mean, of_noise = map(self._residual_of, islice(columns, 1)), map(self._residual, islice(columns, draws))
-        return inputs.power(chain(of_mean, of_noise, map(self._residual_of, columns)), task.expected_noise)
+        power = inputs.power(chain(of_mean, of_noise, map(self._residual_of, columns)), task.expected_noise)
+        return replace(power, bias=None)  # 0 for f0; that of another image takes its place
 
     def _residual_power(self, power: ResidualPower, deviation: FloatArray | None) -> ResidualPower:
         """Return the expected squares of the residual for the true image f0 + `deviation`, (N,), if it is known."""
         if deviation is None:
             return replace(power, bias=None, noise=None)
-        white = 1 / np.sqrt(self.task.expected_noise)
-        return replace(power, bias=np.square(white * self._residual_of(deviation)))
+        bias = self._residual_of(deviation)
+        np.square(bias, out=bias)
+        bias /= self.task.expected_noise
+        return replace(power, bias=bias)
 
     def _residual_of(self, deviation: FloatArray) -> FloatArray:
         """Return (I - H A) H f = H C P0^-1 f of an image less its mean: (measurements used,)."""

@@ -396,7 +396,12 @@ class Method(ABC):
         operators = None if level is None else self.operators()
         if level is None or operators is None:
             return result
-        return _with_level(result, level, self.task, total_variance(noise), operators)
+        return _with_level(result, level, self.task, self.actual_noise(noise), operators)
+
+    def actual_noise(self, noise: dict[str, FloatArray]) -> FloatArray:
+        """Return Rvm, (measurements used,); Rv itself where it is the same, as a large frame has no room for both."""
+        total, expected = total_variance(noise), self.task.expected_noise
+        return expected if np.array_equal(total, expected) else total
 
     def _result_for_actual_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         ratio = self.task.prior_ratio
@@ -421,10 +426,14 @@ def _with_level(
     """Return the result for the prior's mean with the level added; actual : (measurements used,) Rvm."""
     read, response, expected = task.observe(level.response), task.of_f(level.response), result.expected
     gain = level.variance * operators.weigh(read)
-    other = (actual - task.prior_ratio * task.expected_noise) * gain
+    other = actual - task.prior_ratio * task.expected_noise
+    other *= gain
     variance, before = level.variance_for(gain, other, task.prior_ratio), result.variance_of_sum
     beside = task.of_f(operators.gain(other)) if other.any() else np.zeros(response.size)
     more = np.maximum(variance * response**2 + 2 * beside * response, -expected.variance)
+    read *= -level.value
+    read /= task.expected_noise
+    read += result.multipliers
 
     def variance_of_sum(weights: FloatArray) -> float:
         along = float(weights @ response)
@@ -433,7 +442,7 @@ def _with_level(
     return replace(
         result,
         image=result.image + level.value * response,
-        multipliers=result.multipliers - level.value * read / task.expected_noise,
+        multipliers=read,
         expected=replace(expected, variance=expected.variance + more, missing=expected.missing + float(more.mean())),
         variance_of_sum=variance_of_sum,
     )

@@ -22,6 +22,7 @@ from functools import cached_property, lru_cache
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -54,7 +55,7 @@ class SharedResidual:
         """Mean squares, (measurements used,)."""
         return np.square(self.columns, dtype=np.float64).sum(axis=0)
 
-    def squared_traces(self, labels: IntArray, count: int) -> FloatArray:
+    def squared_traces(self, labels: NDArray[np.integer], count: int) -> FloatArray:
         """Return tr W^2 of the covariance W of the measurements with each label from 0 to `count` - 1."""
         traces = np.zeros(count)
         for label in range(count):
@@ -235,15 +236,15 @@ def residual_parts(residual: WhitenedResidual, camera: Camera) -> list[ResidualP
 
 
 @lru_cache(maxsize=1)  # for the next frame of the same camera
-def regions(camera: Camera) -> IntArray:
+def regions(camera: Camera) -> NDArray[np.uint8]:
     """Return the region of the target in which each measurement is centred, by rows from 0: (M,), not to be changed."""
-    numbers = np.empty(camera.measurements, dtype=np.int64)
+    numbers = np.empty(camera.measurements, dtype=np.uint8)
     for sub, part in zip(camera.sub_imagers, camera.slices(), strict=True):
         thirds = [
             np.clip((float(start) + float(sub.type.ratio) * (np.arange(count) + 0.5)) * REGIONS / size, 0, REGIONS - 1)
             for start, count, size in zip(sub.window, sub.type.pixels, camera.shape, strict=True)
         ]
-        rows, columns = (third.astype(np.int64) for third in thirds)
+        rows, columns = (third.astype(np.uint8) for third in thirds)
         numbers[part] = np.add.outer(REGIONS * rows, columns).ravel()
     return numbers
 
@@ -252,7 +253,7 @@ def regions(camera: Camera) -> IntArray:
 class _Scattered:
     """Parts of the measurements used, by the index of the part of each: (measurements used,)."""
 
-    labels: IntArray
+    labels: NDArray[np.integer]
     count: int
 
     def sums(self, values: FloatArray | Float32Array) -> FloatArray:
@@ -344,10 +345,10 @@ class _Sums:
         residual = self.residual
         variance = 2 * residual.largest * sums
         if residual.spread.any():
-            variance += 3 * of.sums(residual.spread * power**2)
+            variance += 3 * of.sums(_scaled(np.square(power), residual.spread))
         if residual.shared.any():
             subs = self.subs.count
-            both = _Scattered(self.subs.labels + subs * of.labels, subs * of.count)
+            both = _Scattered(self.subs.labels + subs * of.labels.astype(np.intp), subs * of.count)
             shared = both.sums(residual.shared * power).reshape(of.count, subs)
             variance += 2 / SHARED_FREEDOMS * np.square(shared).sum(axis=1)
         return variance

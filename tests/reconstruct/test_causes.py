@@ -212,6 +212,17 @@ def test_noise_is_named_where_the_picture_is_flat() -> None:
     assert "noise of 8" in restore(stack, ideal_model(described, stack.camera)).verdict.reasons[0]
 
 
+def test_steps_of_the_bits_that_the_scene_states_are_no_cause() -> None:
+    """Noise of twice the stated variance, in steps of 10 bits: another 0.0052 in variance would explain half of it."""
+    noise, step = {"variance": 1e-2, "bits": 10}, 0.25
+    described = scene(lenses=THREE, noise=noise, calibration={"method": "ideal"})
+    camera, rng = derive(described), np.random.default_rng(1)
+    light = seen(camera, picture(1.0), as_designed)
+    values = step * np.round((light + rng.normal(size=light.size) * 2e-2**0.5) / step)
+    stack = Stack(described, camera, values, np.zeros(values.size), {})
+    assert_named("noise", "noise.variance", restore(stack, ideal_model(described, camera)).verdict.reasons[0])
+
+
 def test_a_black_level_shows_where_lenses_lose_light_unevenly() -> None:
     stack, model = recorded(1e-2)
     lost = np.random.default_rng(5).uniform(0.6, 1.0, stack.values.size)

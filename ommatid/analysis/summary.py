@@ -81,6 +81,7 @@ def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "array": list(lens_type.array),
         "pixels": list(lens_type.pixels),
         "step": lens_type.described_step,
+        **({} if lens_type.open == 1 else {"fill_factor": str(lens_type.open)}),
         **({"steered": len(lens_type.steered)} if lens_type.steered else {}),
         "sees_rows": [float(end) for end in lens_type.bounds[0]],
         "sees_columns": [float(end) for end in lens_type.bounds[1]],
@@ -197,7 +198,8 @@ def _lens_words(lens: dict[str, Any], wavelength: float) -> str:
         [
             f"{array[0]} x {array[1]} sub-imagers of {pixels[0]} x {pixels[1]} pixels,"
             f" {lens['sub_image_width']:.3g} mm wide, rows {lens['sees_rows'][0]:g} to {lens['sees_rows'][1]:g}"
-            + (f", {lens['steered']} of them steered" if "steered" in lens else ""),
+            + (f", {lens['steered']} of them steered" if "steered" in lens else "")
+            + (f", {lens['fill_factor']} of a pixel's side open" if "fill_factor" in lens else ""),
             f"  optical magnification {_ratio(lens['optical_magnification'])}, focal length"
             f" {lens['focal_length']:.4g} mm,{aperture} sensor {lens['total_track']:.4g} mm behind the lens",
             f"  field of view {view}{disk}",

@@ -92,8 +92,8 @@ def best_single_sub_image(stack: Stack, truth: FloatArray | None) -> SingleSubIm
 
 
 def enlarged(camera: Camera, sub: SubImager, image: FloatArray, rows: FloatArray) -> FloatArray:
-    """Interpolate a sub-image at the pixels of some rows of f: (rows, columns of f)."""
-    known, columns = _without_gaps(image), np.arange(float(camera.columns))
+    """Interpolate a sub-image, as bright as f, at the pixels of some rows of f: (rows, columns of f)."""
+    known, columns = _without_gaps(image) / float(sub.type.light), np.arange(float(camera.columns))
     if sub.rotation == 0 and sub.type.optics.distortion is None:
         down, _ = positions(camera, sub, rows, np.zeros(rows.size))
         _, across = positions(camera, sub, np.zeros(camera.columns), columns)

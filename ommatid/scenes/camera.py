@@ -9,6 +9,7 @@ types as listed, sub-imagers (k, l) by rows, then pixels by rows.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import cached_property
 from itertools import accumulate
 from math import floor, hypot
@@ -140,13 +141,13 @@ class Camera:
         return self.walls and not (bent or self.is_blurred(lens_type))
 
     def has_kernel(self, lens_type: LensType) -> bool:
-        """True if the designed H of a lens type may be a few kernels: a blurred one whose boxes are whole pixels.
+        """True if the designed H of a lens type may be a few kernels: a blurred one whose pixels all cut those of f alike.
 
         Kernels of surfaces are traced, and held by a model; distortion of more than a pixel or so is not held by them.
         """
         if lens_type.optics.distortion is not None or (lens_type.optics.surfaces is not None and lens_type.steered):
             return False
-        return self.walls and self.is_blurred(lens_type) and lens_type.covers_whole_pixels
+        return self.walls and self.is_blurred(lens_type) and lens_type.is_aligned
 
     @property
     def has_surfaces(self) -> bool:
@@ -200,6 +201,11 @@ class Camera:
             places.append(np.stack([down.ravel(), np.broadcast_to(axes[1][None, :, None, :], order).ravel()]))
         row, column = np.concatenate(places, axis=1)
         return row, column
+
+    @property
+    def received(self) -> FloatArray:
+        """Share of the light on each sensor pixel that its open part receives: (M,)."""
+        return np.repeat([float(each.light) for each in self.types], [each.measurements for each in self.types])
 
     @cached_property
     def sub_imagers(self) -> tuple[SubImager, ...]:
@@ -278,6 +284,7 @@ class Camera:
                 "array": list(lens_type.array),
                 "pixels": list(lens_type.pixels),
                 "step": lens_type.described_step,
+                **({} if lens_type.open == 1 else {"open": str(lens_type.open), "light": str(lens_type.light)}),
                 **lens_type.optics.describe(),
                 **({"sub_imagers": [each.describe() for each in lens_type.steered]} if lens_type.steered else {}),
             }
@@ -343,5 +350,7 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
         )
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # reading the scene replaced file names
     optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale, lens.coating)
-    lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics)
+    part = scene.camera.fill_factor if lens.fill_factor is None else lens.fill_factor
+    light = Fraction(1) if scene.camera.fill_light == "kept" else part**2
+    lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics, open=part, light=light)
     return with_steering(lens_type.centred(rows, columns), lens.sub_imager or (), (rows, columns), scene.source)

@@ -96,6 +96,7 @@ class LensType:
     left : columns of sub-imagers of other types to its left; None: those of the types listed before it
     steered : sub-imagers off the grid;  rotation : of all sensor patches
     above : rows of lenses above it, and rows of all, of a part of an array; None of a whole array
+    open : side of the square open part of a sensor pixel over its pitch;  light : of a uniform target that it receives
     """
 
     name: str
@@ -109,6 +110,18 @@ class LensType:
     steered: tuple[Steering, ...] = ()
     rotation: float = 0.0
     above: tuple[int, int] | None = None
+    open: Fraction = Fraction(1)
+    light: Fraction = Fraction(1)
+
+    @property
+    def footprint(self) -> Fraction:
+        """Pixels of f that the open part of a sensor pixel covers along one axis."""
+        return self.open * self.ratio
+
+    @property
+    def inset(self) -> Fraction:
+        """Pixels of f from the edge of a sensor pixel to that of its open part."""
+        return (self.ratio - self.footprint) / 2
 
     @property
     def count(self) -> int:
@@ -182,10 +195,15 @@ class LensType:
         return whole and not self.steered and self.step == (1, 1)
 
     @property
-    def covers_whole_pixels(self) -> bool:
-        """True if footprints of pinholes are whole pixels of f."""
+    def is_aligned(self) -> bool:
+        """True if sensor pixels of pinholes begin and end between pixels of f, so that all cut these alike."""
         ends = [number for part in self.on_grids for number in (*part.origin, *part.step, part.ratio)]
         return not self.is_rotated and all(number.denominator == 1 for number in ends)
+
+    @property
+    def covers_whole_pixels(self) -> bool:
+        """True if footprints of pinholes are whole pixels of f."""
+        return self.is_aligned and self.footprint.denominator == self.inset.denominator == 1
 
     @property
     def bounds(self) -> tuple[tuple[Fraction, Fraction], tuple[Fraction, Fraction]]:

@@ -183,6 +183,7 @@ class Model:
         level = self.matrix @ flat
         if self.record["method"] == RECORDED:
             return self._row_sums(self.variance * contrast**2) + self._shared_variance(contrast)
+        level = level / self.camera.received  # mean over the open part of a pixel
         variance = self._row_sums(self.variance * (contrast - level[self._rows]) ** 2)
         count = len(self.batches)
         if count < 2:
@@ -194,7 +195,7 @@ class Model:
 
     def scatter(self, image: FloatArray) -> FloatArray:
         """Variance of H f of one image, (N,), by the batches alone, where there are two or more: (M,)."""
-        level, count = self.matrix @ image, len(self.batches)
+        level, count = self.matrix @ image / self.camera.received, len(self.batches)
         contrast = image[self.matrix.indices] - level[self._rows]
         squares = (
             np.square(self._row_sums(batch * contrast) + lost * level)

@@ -139,7 +139,10 @@ def render_until(
             progress(1 - len(rounds.unfinished) / len(rounds.sub_imagers))
     progress(1.0)
     details = {"variant": variant, **rounds.record()}
-    return AdaptiveRendering(rounds.mean, rounds.variance, details, renderer.direct_only)
+    received = setup.camera.received
+    return AdaptiveRendering(
+        received * rounds.mean, np.square(received) * rounds.variance, details, renderer.direct_only
+    )
 
 
 def _warn_of_cost(rounds: AdaptiveRounds, speed: float) -> bool:
@@ -351,8 +354,8 @@ class AdaptiveRounds:
         """Return a plan that fits the edges of pixels of f or Sobol's points, where the sampler can make use of it."""
         if self._sobol[index]:
             return power_of_two_plan(samples, most)
-        ratio = self._camera.sub_imagers[index].type.ratio
-        return on_grid(samples, self._scene.render.sampler, cells_of(ratio), most)
+        side = self._camera.sub_imagers[index].type.footprint
+        return on_grid(samples, self._scene.render.sampler, cells_of(side), most)
 
     def state(self) -> State:
         """Return the arrays of a checkpoint."""
@@ -474,23 +477,23 @@ def check_noise_target(scene: Scene) -> None:
 
 
 def allowed_variance(setup: Setup) -> AllowedVariance:
-    """Return the function from light on some measurements, and their slice, to the allowed variance of its rendering.
+    """Return the function from light on open parts, and the slice of these, to the allowed variance of its rendering.
 
     NaN where a pixel receives no light. Raises InputError if the sensor adds no noise.
     """
     check_noise_target(setup.scene)
-    sensor, noise = setup.scene.sensor, setup.scene.noise
+    sensor, noise, received = setup.scene.sensor, setup.scene.noise, setup.camera.received
     if sensor is None:
         known = 0.0 if noise is None else noise.variance + noise.quantisation_variance
-        return lambda light, _: np.full(light.shape, SHARE * known)
+        return lambda _, rows: SHARE * known / np.square(received[rows])
     from .sensors import response
 
     electrons = response(setup)
     level = flat_values(sensor, setup.camera, electrons)
 
     def of_sensor(light: FloatArray, rows: slice) -> FloatArray:
-        values = np.maximum(np.nan_to_num(light), 0.0)
+        values = received[rows] * np.maximum(np.nan_to_num(light), 0.0)
         expected = expected_recording_of(sensor, level[rows], electrons[rows], values)
-        return SHARE * expected.noise_variance(values)
+        return SHARE * expected.noise_variance(values) / np.square(received[rows])
 
     return of_sensor

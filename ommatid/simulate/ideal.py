@@ -29,9 +29,11 @@ from ommatid.scenes.scene import Scene
 
 def sub_matrix(camera: Camera, sub: SubImager) -> sparse.csr_array:
     """Return H of one sub-imager behind a pinhole: (its pixels, N)."""
-    down = overlap(sub.type.ratio, sub.type.pixels[0], sub.window[0], camera.rows)
-    across = overlap(sub.type.ratio, sub.type.pixels[1], sub.window[1], camera.columns)
-    return sparse.csr_array(sparse.kron(down, across, format="csr"))
+    down, across = (
+        overlap(sub.type.ratio, pixels, start, size, sub.type.open)
+        for pixels, start, size in zip(sub.type.pixels, sub.window, camera.shape, strict=True)
+    )
+    return float(sub.type.light) * sparse.csr_array(sparse.kron(down, across, format="csr"))
 
 
 def ideal_matrix(camera: Camera) -> sparse.csr_array:

@@ -114,6 +114,8 @@ def light(
     renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     mean, variance = render_bands(renderer, scene.render.seed, work, progress, checkpoint)
+    mean *= setup.camera.received
+    variance *= np.square(setup.camera.received)
     return Rendering(
         passes=work.passes,
         samples=work.samples,

@@ -319,7 +319,7 @@ def bands_of(camera: Camera, detail: int, spectrum: FloatArray, weights: FloatAr
     noise: list[float] = []
     for lens_type, rows in zip(camera.types, camera.type_slices(), strict=True):
         part = parts.get(lens_type.name)
-        kernel = _box(float(lens_type.ratio)) if part is None else part.mean_kernel
+        kernel = _box(lens_type) if part is None else part.mean_kernel
         means.append(_by_kernel(lens_type, kernel, detail))
         # In front of a finer world every kernel would be one row more in every group.
         types.append(means[-1] if part is not None or detail > 1 else _boxes(lens_type))
@@ -342,12 +342,12 @@ def _by_kernel(lens_type: LensType, kernel: FloatArray, detail: int) -> Readings
     return Readings((upright + upright[:, ::-1])[None] / 4, (first[0], first[1]), (count[0], count[1]))
 
 
-def _box(ratio: float) -> FloatArray:
-    """Return the mean over a box of this side: (rows, columns)."""
-    side = ceil(ratio)
-    share = np.full(side, 1 / ratio)
-    share[[0, -1]] = (1 - (side - 2) / ratio) / 2 if side > 1 else 1.0
-    return np.outer(share, share)
+def _box(lens_type: LensType) -> FloatArray:
+    """Return the reading by a box in the middle of a pixel's footprint: (rows, columns) of the pixel's whole width."""
+    side, width = float(lens_type.footprint), ceil(lens_type.ratio)
+    edges: FloatArray = np.clip(np.arange(width + 1.0) - width / 2, -side / 2, side / 2)
+    share = np.diff(edges) / side
+    return np.outer(float(lens_type.light) * share, share)
 
 
 def _boxes(lens_type: LensType) -> Readings:
@@ -355,20 +355,22 @@ def _boxes(lens_type: LensType) -> Readings:
     ratio, axes = lens_type.ratio, list[FloatArray]()
     first, count = list[int](), list[int]()
     for axis, (start, end) in enumerate(lens_type.bounds):
-        first.append(floor(start))
-        count.append(max(floor(end - ratio - first[axis]) + 1, 1))
+        first.append(floor(start + lens_type.inset))
+        count.append(max(floor(end + lens_type.inset - ratio - first[axis]) + 1, 1))
         views = product(lens_type.starts(axis), range(lens_type.pixels[axis]))
-        axes.append(_mean_power(float(ratio), [float((view + ratio * n - first[axis]) % 1) for view, n in views]))
-    kernels = np.einsum("ax,by->abxy", *axes).reshape(-1, axes[0].shape[1], axes[1].shape[1])
+        places = [float((view + lens_type.inset + ratio * n) % 1) for view, n in views]
+        axes.append(_mean_power(float(lens_type.footprint), places))
+    kernels = float(lens_type.light) * np.einsum("ax,by->abxy", *axes)
+    kernels = kernels.reshape(-1, axes[0].shape[1], axes[1].shape[1])
     power = np.square(kernels).sum(axis=(1, 2))
     return Readings(kernels[power > LEAST_PART * power.max()], (first[0], first[1]), (count[0], count[1]))
 
 
-def _mean_power(ratio: float, starts: list[float]) -> FloatArray:
+def _mean_power(side: float, starts: list[float]) -> FloatArray:
     """Return even and odd lines, the sum of whose powers is the mean of that of boxes: (lines, pixels)."""
     places, counts = np.unique(np.round(starts, 9), return_counts=True)
-    edges = np.arange(ceil(float(places.max()) + ratio) + 1.0)
-    shares: FloatArray = np.diff(np.minimum(np.maximum(edges - places[:, None], 0.0), ratio)) / ratio
+    edges = np.arange(ceil(float(places.max()) + side) + 1.0)
+    shares: FloatArray = np.diff(np.minimum(np.maximum(edges - places[:, None], 0.0), side)) / side
     shares *= np.sqrt(counts / counts.sum())[:, None]
     parts = [np.linalg.svd((shares + sign * shares[:, ::-1]) / 2, full_matrices=False) for sign in (1, -1)]
     return np.concatenate([values[:, None] * vectors for _, values, vectors in parts])

@@ -404,12 +404,12 @@ def band_width(camera: Camera) -> int:
 
 
 def leaves_null_space(camera: Camera) -> bool:
-    """Return True unless three lens types of pairwise coprime whole ratios, m x m each, see the frame.
+    """Return True unless three lens types with footprints of pairwise coprime whole sides, m x m each, see the frame.
 
     Two of them leave 2 (m - 1) (n - 1) dimensions and more (docs/equations.md), and errors that reach far.
     """
-    ratios = {lens_type.ratio for lens_type in camera.types}
-    whole = sorted(int(ratio) for ratio in ratios if ratio.denominator == 1)
+    sides = {lens_type.footprint for lens_type in camera.types}
+    whole = sorted(int(side) for side in sides if side.denominator == 1)
     return (
         not any(
             np.gcd(a, b) == np.gcd(a, c) == np.gcd(b, c) == 1

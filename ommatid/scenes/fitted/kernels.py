@@ -259,6 +259,12 @@ class KernelFootprints(ObservationPart):
         none = self.error_coefficients[:0, :0]
         return replace(self, shapes=self.shapes.without_errors, error_coefficients=none)
 
+    def times(self, factor: float) -> KernelFootprints:
+        """Return H and its errors multiplied by a factor."""
+        return replace(
+            self, coefficients=factor * self.coefficients, error_coefficients=factor * self.error_coefficients
+        )
+
     def forward(self, seen: Seen, out: FloatArray) -> None:
         """Write H f to `out`, (measurements of the type,)."""
         grid, total, room = self._grid(seen.padded), np.zeros(self.places.sensor), np.empty_like(seen.spectrum)

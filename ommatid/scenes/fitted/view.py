@@ -103,7 +103,7 @@ def displacements(
     middle = sub.type.middle(sub.window)
     axis = camera.rows / 2 - sub.lens[1] / camera.target_pitch, camera.columns / 2 - sub.lens[0] / camera.target_pitch
     aside = down + middle[0] - axis[0], across + middle[1] - axis[1]
-    over = float(sub.type.ratio) ** 2 / 3  # by which the mean of (x^2 + y^2) x over a footprint exceeds its middle's
+    over = float(sub.type.footprint) ** 2 / 3  # mean of (x^2 + y^2) x over a footprint less its middle's
     square = (np.square(aside[0]) + np.square(aside[1]) + over) * (camera.target_pitch / camera.half_diagonal) ** 2
     rows = np.column_stack([ones, none, -down, across, -aside[0] * square])
     columns = np.column_stack([none, ones, -across, -down, -aside[1] * square])
@@ -119,20 +119,19 @@ def scales(camera: Camera, sub: SubImager) -> FloatArray:
     return np.array([1.0, 1.0, 1 / half, 1 / half, corner**2 / furthest**3])
 
 
-def real_overlap(ratio: float, pixels: int, start: float, size: int) -> sparse.csr_array:
-    """Shares of `size` unit cells in `pixels` adjacent intervals of length `ratio` from `start` on: (pixels, size).
+def real_overlap(lower: FloatArray, length: float, size: int) -> sparse.csr_array:
+    """Shares of `size` unit cells in intervals of a length that begin at `lower`, (intervals,): (intervals, size).
 
     Every interval has an entry, 0 where it lies outside all cells.
     """
-    lower = start + ratio * np.arange(pixels)
     first = np.clip(np.floor(lower), 0, size - 1).astype(np.int64)
-    cells = first[:, None] + np.arange(int(np.ceil(ratio)) + 1)
-    shared = np.minimum((lower + ratio)[:, None], cells + 1.0) - np.maximum(lower[:, None], cells)
+    cells = first[:, None] + np.arange(int(np.ceil(length)) + 1)
+    shared = np.minimum((lower + length)[:, None], cells + 1.0) - np.maximum(lower[:, None], cells)
     shared = np.where(cells < size, np.maximum(shared, 0.0), 0.0)
     kept = shared > 0
     kept[:, 0] = True
-    rows = np.broadcast_to(np.arange(pixels)[:, None], cells.shape)[kept]
-    return sparse.csr_array((shared[kept] / ratio, (rows, cells[kept])), shape=(pixels, size))
+    rows = np.broadcast_to(np.arange(lower.size)[:, None], cells.shape)[kept]
+    return sparse.csr_array((shared[kept] / length, (rows, cells[kept])), shape=(lower.size, size))
 
 
 def real_box(shape: tuple[int, int], sub: SubImager, numbers: FloatArray) -> Box:
@@ -140,11 +139,13 @@ def real_box(shape: tuple[int, int], sub: SubImager, numbers: FloatArray) -> Box
     ratio = float(sub.type.ratio) / (1 + float(numbers[MAGNIFICATION]))
     middle = sub.type.middle(sub.window)
     alone = replace(sub.type, array=(1, 1), steered=())
-    axes = [
-        BoxAxis(real_overlap(ratio, pixels, centre + float(numbers[number]) - ratio * pixels / 2, size))
-        for pixels, centre, number, size in zip(sub.type.pixels, middle, (ROW, COLUMN), shape, strict=True)
-    ]
-    return Box(alone, *axes)
+    length = float(sub.type.open) * ratio
+    axes: list[sparse.csr_array] = []
+    for pixels, centre, number, size in zip(sub.type.pixels, middle, (ROW, COLUMN), shape, strict=True):
+        start = centre + float(numbers[number]) - ratio * pixels / 2 + (ratio - length) / 2
+        axes.append(real_overlap(start + ratio * np.arange(pixels, dtype=np.float64), length, size))
+    axes[0].data *= float(sub.type.light)
+    return Box(alone, *map(BoxAxis, axes))
 
 
 def part_of(camera: Camera, sub: SubImager, numbers: FloatArray) -> Box | Entries:

@@ -63,7 +63,7 @@ class FootprintAssignment:
         pixels: list[IntArray] = []
         distances: list[FloatArray] = []
         for measurements, box, middles in self._parts:
-            half = float(box.lens_type.ratio) / 2
+            half = float(box.lens_type.footprint) / 2
             down, across = (np.abs(of - (at + 0.5)) for of, at in zip(middles, (row, column), strict=True))
             rows, columns = (np.flatnonzero(of < half + self.margin + 0.5 - TIE) for of in (down, across))
             pixels.append(measurements.start + box.numbers(rows, columns))

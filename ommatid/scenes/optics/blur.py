@@ -142,7 +142,8 @@ def matrix(camera: Camera, lens_type: LensType, *blurs: tuple[Blur, float]) -> s
     the variation within a sensor pixel, and the share `diffraction.TAIL` of the light, which lands further out.
     """
     reach = max(blur.reach for blur, _ in blurs)
-    unit = lcm(*(number.denominator for number in (lens_type.ratio, *lens_type.step, *lens_type.origin)))
+    numbers = lens_type.ratio, lens_type.footprint, *lens_type.step, *lens_type.origin
+    unit = lcm(*(number.denominator for number in numbers))
     down, across = (_axis(camera, lens_type, reach, axis, unit) for axis in (0, 1))
     offsets = np.unique(np.abs(np.concatenate([down.offset.ravel(), across.offset.ravel()])))  # symmetric
     table, slope = _tables(camera, lens_type, offsets, unit, blurs)
@@ -158,7 +159,8 @@ def matrix(camera: Camera, lens_type: LensType, *blurs: tuple[Blur, float]) -> s
         counts.append(lit.sum(axis=(3, 4)).ravel())
     pointers = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
     shape = (lens_type.measurements, camera.unknowns)
-    return sparse.csr_array((np.concatenate(data), np.concatenate(indices), pointers), shape=shape)
+    values = float(lens_type.light) * np.concatenate(data)
+    return sparse.csr_array((values, np.concatenate(indices), pointers), shape=shape)
 
 
 def _tables(
@@ -167,8 +169,8 @@ def _tables(
     """Entries of H for all pairs of offsets down and across, and their slope of `_asymmetry` if any: (n, n) each."""
     needed = TABLES * 8 * offsets.size**2
     check_memory(needed, f"camera.lens.{lens_type.name}: its blur", "take simpler ratios, or less blur")
-    reach, ratio = max(blur.reach for blur, _ in blurs), float(lens_type.ratio)
-    gap = np.maximum(offsets - unit - int(lens_type.ratio * unit), 0) / (2 * unit)
+    reach, ratio = max(blur.reach for blur, _ in blurs), float(lens_type.footprint)
+    gap = np.maximum(offsets - unit - int(lens_type.footprint * unit), 0) / (2 * unit)
     lit = np.hypot.outer(gap, gap) < max(reach, np.finfo(float).tiny)
     table = np.where(lit, sum(share * transfer(ratio, offsets, unit, blur) for blur, share in blurs), 0.0)
     slanted = [(blur, share) for blur, share in blurs if blur.disk and blur.weight]
@@ -186,14 +188,15 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
     places = KernelPlaces(camera, lens_type, ceil(max(blur.reach for blur, _ in blurs)))
     beside = 2 * np.arange(places.width) + 1 - places.width  # from the footprint's middle, in halves of a pixel
     offsets, index = np.unique(np.abs(beside), return_inverse=True)
-    table, slope = _tables(camera, lens_type, offsets, 1, blurs)
+    unit, light = lens_type.footprint.denominator, float(lens_type.light)
+    table, slope = _tables(camera, lens_type, unit * offsets, unit, blurs)
     mean = table[np.ix_(index, index)]
     if slope is None:
-        return KernelFootprints(places, 0, KernelShapes.dense(mean[None]), np.ones((1, 1)), np.zeros((0, 0, 1)))
+        return KernelFootprints(places, 0, KernelShapes.dense(mean[None]), np.full((1, 1), light), np.zeros((0, 0, 1)))
     upward = np.sign(beside)[:, None] * slope[np.ix_(index, index)]
     weights = np.diag([1.0, places.scale, places.scale])  # Legendre's P1 is the coordinate itself
     shapes = KernelShapes.dense(np.stack([mean, upward, upward.T]))
-    return KernelFootprints(places, 1, shapes, weights, np.zeros((0, 0, 3)))
+    return KernelFootprints(places, 1, shapes, light * weights, np.zeros((0, 0, 3)))
 
 
 def entries(camera: Camera, lens_type: LensType, reach: float) -> int:
@@ -253,7 +256,7 @@ def _differences(ratio: float, offsets: IntArray, unit: int) -> tuple[FloatArray
 
 def _asymmetry(camera: Camera, lens_type: LensType, blur: Blur, offsets: IntArray, unit: int) -> FloatArray:
     """Change of an entry of H per pixel of f between a lens and the footprint of its pixel, along y: (n, n)."""
-    inside = steepness(float(lens_type.ratio), offsets, unit, blur.slant_density)
+    inside = steepness(float(lens_type.footprint), offsets, unit, blur.slant_density)
     # A pixel at s sees the pupil's amplitude 2 s sqrt(weight) / depth brighter at the rim on its side.
     lever = 2 * np.sqrt(blur.weight) * camera.target_pitch / camera.distance
     return -np.sign(1 - camera.distance / camera.focus(lens_type)) * lever * inside

@@ -24,11 +24,17 @@ if TYPE_CHECKING:
     from ..camera import Camera
 
 
-def overlap(ratio: Fraction, pixels: int, start: Fraction, size: int) -> sparse.csr_array:
-    """Shares of `size` unit cells in `pixels` adjacent intervals of length `ratio` from `start` on: (pixels, size)."""
-    unit = lcm(ratio.denominator, start.denominator)
-    length = int(ratio * unit)
-    lower = int(start * unit) + length * np.arange(pixels, dtype=np.int64)
+def overlap(
+    ratio: Fraction, pixels: int, start: Fraction, size: int, part: Fraction = Fraction(1)
+) -> sparse.csr_array:
+    """Shares of `size` unit cells in `pixels` adjacent intervals of length `ratio` from `start` on: (pixels, size).
+
+    part : of each interval, in its middle, that counts
+    """
+    first = start + ratio * (1 - part) / 2
+    unit = lcm(*(each.denominator for each in (ratio, part * ratio, first)))
+    pitch, length = int(ratio * unit), int(part * ratio * unit)
+    lower = int(first * unit) + pitch * np.arange(pixels, dtype=np.int64)
     width = -(-length // unit) + 1  # most cells that an interval touches
     cells = (lower // unit)[:, None] + np.arange(width)
     shared = np.minimum(lower[:, None] + length, (cells + 1) * unit) - np.maximum(lower[:, None], cells * unit)
@@ -128,12 +134,14 @@ class Box(ObservationPart):
 
 def designed_box(shape: tuple[int, int], lens_type: LensType) -> Box:
     """H of a lens type as designed, on a target of this shape."""
-    return Box(lens_type, _axis(shape[0], lens_type, 0), _axis(shape[1], lens_type, 1))
+    down, across = (_axis(size, lens_type, axis) for axis, size in enumerate(shape))
+    down.shares.data *= float(lens_type.light)
+    return Box(lens_type, down, across)
 
 
 def _axis(size: int, lens_type: LensType, axis: int) -> BoxAxis:
-    ratio, pixels = lens_type.ratio, lens_type.pixels[axis]
-    parts = [overlap(ratio, pixels, start, size) for start in lens_type.starts(axis)]
+    ratio, pixels, starts = lens_type.ratio, lens_type.pixels[axis], lens_type.starts(axis)
+    parts = [overlap(ratio, pixels, start, size, lens_type.open) for start in starts]
     return BoxAxis(sparse.csr_array(sparse.vstack(parts, format="csr")))
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from math import lcm
 
 import numpy as np
 from scipy import sparse
@@ -24,7 +25,7 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.machine import processors
 
 from ..camera import Camera
-from ..lens_type import SubImager
+from ..lens_type import LensType, SubImager
 from ..pose import Pose, corner_offset
 from .distortion import coefficients, distort, field
 
@@ -40,6 +41,8 @@ Image = Callable[[FloatArray, FloatArray], FloatArray]
 
 def sub_matrix(camera: Camera, sub: SubImager, pose: Pose) -> sparse.csr_array:
     """H of one sub-imager: (its pixels, N), with entries accurate to 1e-13, or 1e-7 with distortion.
+
+    Pixels that are open in part are divided, and the parts inside the opening averaged.
 
     Raises InputError if its distortion folds the image, ValueError if its lens has surfaces.
     """
@@ -59,17 +62,33 @@ def sub_matrix(camera: Camera, sub: SubImager, pose: Pose) -> sparse.csr_array:
         return np.stack([u, v]) / np.where(w < LEAST_DEPTH, np.nan, w)
 
     parts = _parts(image, camera.shape) if any(k) else 1
+    division, opening = _opening(sub.type)
+    pixels_divided = sub.type.pixels[0] * division, sub.type.pixels[1] * division
     tall = max(1, BLOCK // (camera.columns * parts))
     blocks: list[sparse.csc_array] = []
     for top in range(0, camera.rows, tall):
         rows = range(top, min(top + tall, camera.rows))
-        pixels, texels, shares = _shares(_edges(image, rows, camera.columns, parts), sub.type.pixels)
-        shape = sub.type.pixels[0] * sub.type.pixels[1], len(rows) * camera.columns
+        edges = division * _edges(image, rows, camera.columns, parts)
+        pixels, texels, shares = _shares(edges, pixels_divided)
+        shape = pixels_divided[0] * pixels_divided[1], len(rows) * camera.columns
         blocks.append(sparse.csc_array((shares, (pixels, texels)), shape))
     h = sparse.csr_array(sparse.hstack(blocks, format="csr"))
     h.data[h.data < LEAST_SHARE] = 0
     h.eliminate_zeros()
-    return h
+    if division > 1:
+        down, across = (sparse.kron(sparse.eye_array(count), opening[None]) for count in sub.type.pixels)
+        h = sparse.csr_array(sparse.kron(down, across, format="csr") @ h)
+    return float(sub.type.light) * h
+
+
+def _opening(lens_type: LensType) -> tuple[int, FloatArray]:
+    """Return into how many parts a side of a pixel is divided, and the weight of each in its mean along that side."""
+    beside = (1 - lens_type.open) / 2
+    division = lcm(lens_type.open.denominator, beside.denominator)
+    inside, closed = int(lens_type.open * division), int(beside * division)
+    weights = np.zeros(division)
+    weights[closed : closed + inside] = 1 / inside
+    return division, weights
 
 
 def matrix(camera: Camera, poses: tuple[Pose, ...]) -> sparse.csr_array:

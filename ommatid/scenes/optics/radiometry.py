@@ -114,7 +114,7 @@ def expected_noise(scene: Scene, camera: Camera, response: FloatArray) -> FloatA
     """
     if scene.sensor is None:
         raise ValueError("the noise of a sensor needs a scene with a [sensor], got one without")
-    values = np.full(camera.measurements, max(scene.prior.mean, 0.0))
+    values = camera.received * max(scene.prior.mean, 0.0)
     return expected_recording(scene.sensor, camera, response, values).noise_variance(values)
 
 
@@ -125,7 +125,7 @@ def predicted_noise(scene: Scene, camera: Camera, response: FloatArray) -> Float
     """
     noise = expected_noise(scene, camera, response)
     if scene.sensor is not None:
-        noise[scene.prior.mean * response >= saturation_electrons(scene.sensor)] = np.nan
+        noise[camera.received * scene.prior.mean * response >= saturation_electrons(scene.sensor)] = np.nan
     if np.isnan(noise).all():
         raise InputError(
             f"{scene.source}: sensor: at the prior's mean, {scene.prior.mean:g}, every pixel is full, or none exceeds"
@@ -148,7 +148,8 @@ def summary(scene: Scene, camera: Camera, response: FloatArray) -> dict[str, Any
     sensor, noise = scene.sensor, expected_noise(scene, camera, response)
     lens_types: list[dict[str, Any]] = []
     for lens_type, pixels in zip(camera.types, camera.type_slices(), strict=True):
-        average, brightest = float(response[pixels].mean()), float(response[pixels].max())
+        of_open = float(lens_type.light) * response[pixels]
+        average, brightest = float(of_open.mean()), float(of_open.max())
         saturation = saturation_electrons(sensor) / brightest if brightest > 0 else None
         alive = noise[pixels][np.isfinite(noise[pixels])]
         lens_types.append(

@@ -16,6 +16,7 @@ from .units import (
     Angle,
     Corner,
     FileName,
+    FillFactor,
     Length,
     Magnification,
     Pair,
@@ -155,6 +156,9 @@ class LensTable(Table):
         lt=1,
         description="reflectance of each surface to air; absent: uncoated, by Fresnel's equations",
     )
+    fill_factor: FillFactor | None = Field(
+        default=None, description="side of the open part of a sensor pixel over its pitch; absent: the camera's"
+    )
     sub_imager: (
         Annotated[tuple[SubImagerTable, ...], at_most(MOST_SUB_IMAGERS, "sub_imager tables"), Field(min_length=1)]
         | None
@@ -242,6 +246,16 @@ class CameraTable(Table):
         description="glass catalogue (AGF) with glasses of surfaces beside the built-in ones",
     )
     tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
+    fill_factor: FillFactor = Field(
+        default=Fraction(1),
+        exclude_if=lambda value: value == 1,
+        description="side of the square open part of every sensor pixel, in its middle, over the pitch",
+    )
+    fill_light: Literal["lost", "kept"] = Field(
+        default="lost",
+        exclude_if=lambda value: value == "lost",
+        description='light beside the open parts; "kept": micro-lenses on the pixels gather the light of the whole',
+    )
     sensor: CameraSensorTable | None = Field(
         default=None, description="outline of the sensor; absent: as large as needed"
     )

@@ -40,6 +40,7 @@ FACTORS = {  # of the commonest units, to the last bit as pint has them; pint ta
 }
 LONGEST_NAME, LONGEST_PATH = 255, 4000  # bytes that file systems accept
 LARGEST_VARIANCE = 1e24
+FINEST_PART = 100  # of the side of a sensor pixel, into which exact areas of its open part divide it
 FEWEST_SAMPLES, MOST_SAMPLES = 16, 2**24
 AUTO = "auto"  # samples: as many as needed
 
@@ -133,6 +134,16 @@ def _magnification(value: object) -> Fraction:
     ratio = _ratio(value)
     if not 0 < ratio <= 1:
         raise ValueError(f'expected a magnification above 0 and at most 1, such as "1/3", got {shortened_repr(value)}')
+    return ratio
+
+
+def _fill_factor(value: object) -> Fraction:
+    ratio = _ratio(value)
+    if not 0 < ratio <= 1 or ratio.denominator > FINEST_PART:
+        raise ValueError(
+            f'expected a fill factor above 0 and at most 1 with a denominator of {FINEST_PART} or less, such as "2/3",'
+            f" got {shortened_repr(value)}"
+        )
     return ratio
 
 
@@ -238,6 +249,7 @@ Illuminance = Annotated[
     float, Quantity("lux", "an illuminance", ("500 lux", "1 klux"), 'an illuminance, such as "500 lux"')
 ]
 Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_plain_ratio), _RATIO]
+FillFactor = Annotated[Fraction, BeforeValidator(_fill_factor), PlainSerializer(_plain_ratio), _RATIO]
 Step = Annotated[tuple[Fraction, Fraction], BeforeValidator(_step), PlainSerializer(_plain_step), _STEP]
 Window = Annotated[
     tuple[Fraction, Fraction],

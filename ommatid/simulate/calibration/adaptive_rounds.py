@@ -94,7 +94,8 @@ def plans_of(setup: Setup, samples: int, float64: bool) -> Plans:
     """Return plans of about `samples` per pixel, by lens type, on grids that fit the edges of pixels of f."""
     most, sampler = MOST_EXACT if float64 else MOST_SAMPLES, setup.scene.render.sampler
     return {
-        lens_type.name: on_grid(samples, sampler, cells_of(lens_type.ratio), most) for lens_type in setup.camera.types
+        lens_type.name: on_grid(samples, sampler, cells_of(lens_type.footprint), most)
+        for lens_type in setup.camera.types
     }
 
 

@@ -15,7 +15,7 @@ from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.model import Model, fitted_model
+from ommatid.scenes.model import MeasuredRows, Model, fitted_model
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
@@ -67,12 +67,14 @@ def rendered_model(
             setup.simulated, measure, lambda each: entry_variances(each, camera), rays, with_kernels=not views_alone
         )
         record |= {"fit": fit.record, **fit.responses.record()}
-        model = fitted_model(setup.resolved, camera, fit.matrix, fit.rest, record)
+        rest = None if fit.rest is None else _received(camera, fit.rest)
+        model = fitted_model(setup.resolved, camera, fit.matrix, rest, record)
     else:
         responses = measure(None)
         variance = entry_variances(responses, camera)
+        rows = _received(camera, MeasuredRows(responses.matrix, variance, responses.batches))
         record |= responses.record()
-        model = Model(setup.resolved, camera, responses.matrix, variance, responses.batches, record)
+        model = Model(setup.resolved, camera, rows.matrix, rows.variance, rows.batches, record)
     seconds = perf_counter() - start
     record = model.record | {
         "seconds": seconds,
@@ -81,6 +83,14 @@ def rendered_model(
         "versions": versions("mitsuba", "drjit", "scipy"),
     }
     return replace(model, record=record)
+
+
+def _received(camera: Camera, rows: MeasuredRows) -> MeasuredRows:
+    """Return rows of H from the shares of the rays of open parts that meet pixels of f."""
+    lengths = np.diff(rows.matrix.indptr)
+    received = np.repeat(camera.received, lengths)
+    matrix = sparse.csr_array((received * rows.matrix.data, rows.matrix.indices, rows.matrix.indptr), rows.matrix.shape)
+    return MeasuredRows(matrix, np.square(received) * rows.variance, np.float32(received) * rows.batches)
 
 
 def _is_whole(subsets: Subsets, lens_type: LensType) -> bool:

@@ -113,7 +113,7 @@ def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixel
     if obstacle:
         return KernelFit(False, obstacle)
     try:
-        designed = designed_kernels(camera, lens_type)
+        designed = designed_kernels(camera, lens_type).times(1 / float(lens_type.light))
     except InputError as error:
         return KernelFit(False, str(error))
     chart = chart_of(responses, designed, pixels)
@@ -130,7 +130,7 @@ def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixel
         "count": len(parts.strengths),
         "strengths": [float(each) for each in parts.strengths],
     }
-    return KernelFit(True, reason, _footprints(chart, candidate, parts), details)
+    return KernelFit(True, reason, _footprints(chart, candidate, parts).times(float(lens_type.light)), details)
 
 
 def refusal(camera: Camera, lens_type: LensType) -> str:
@@ -143,8 +143,8 @@ def refusal(camera: Camera, lens_type: LensType) -> str:
         return "its sub-imagers are misaligned"
     if lens_type.steered:
         return "some of its sub-imagers are off the grid"
-    if not lens_type.covers_whole_pixels:
-        return "its footprints are not whole pixels of f"
+    if not lens_type.is_aligned:
+        return "its footprints cut pixels of f in different ways"
     return ""
 
 

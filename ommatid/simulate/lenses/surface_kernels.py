@@ -62,7 +62,7 @@ class _FieldRows:
 
     def _row(self, field: LensField, x: float, y: float, beside: FloatArray) -> FloatArray:
         camera, wide = self.places.camera, self.places.width
-        edges = _edges(camera, field, x, y) - (beside - wide / 2)[:, None]
+        edges = _edges(camera, field, x, y, float(self.places.lens_type.open)) - (beside - wide / 2)[:, None]
         angle, height = float(np.arctan2(-x, y)), float(np.hypot(x, y))
         if field.rays_suffice:
             total = np.zeros((wide, wide))
@@ -84,9 +84,9 @@ class _FieldRows:
         return np.stack(list(known.values()))
 
 
-def _edges(camera: Camera, field: LensField, x: float, y: float) -> FloatArray:
+def _edges(camera: Camera, field: LensField, x: float, y: float, open_part: float) -> FloatArray:
     """Return the edges of a footprint in pixels of f from the lens's axis, by rows and by columns: (2, 2)."""
-    half = camera.pixel_pitch / 2 * np.array([-1.0, 1.0])
+    half = camera.pixel_pitch / 2 * open_part * np.array([-1.0, 1.0])
     across, down = field.centre(x + half, np.full(2, y))[0], field.centre(np.full(2, x), y + half)[1]
     return -np.stack([down, across]) / camera.target_pitch
 
@@ -114,7 +114,7 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
             polynomials = _fitted(field, entries, rows.places.width, degree)
             worst = float(np.abs(basis(field, degree) @ polynomials - entries).max()) / scale
             if worst <= TOLERANCE * (1 - SHARE) or (degree == HIGHEST and worst <= MOST):
-                return _components(rows.places, degree, polynomials, field, scale)
+                return _components(rows.places, degree, polynomials, field, scale).times(float(lens_type.light))
     raise InputError(
         f"camera.lens.{lens_type.name}: its images are displaced and blurred over the field by more than kernels hold:"
         f" an entry of H would be wrong by {worst:.2g} of the largest, expected at most {MOST:g}"
@@ -130,8 +130,9 @@ def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[LensField, 
     for field, _ in fields:
         spot = max(wave.spot_radius for wave in field.nodes[1])
         wide = spot if field.rays_suffice else field.grid[1]
-        edges = np.sort(_edges(camera, field, float(corner[1] * shrink), float(corner[0] * shrink)), axis=1)
-        moved = np.abs(edges - corner[:, None] - places.width / 2 * np.array([-1.0, 1.0])).max()
+        x, y = (float(each) for each in corner[::-1] * shrink)
+        edges = np.sort(_edges(camera, field, x, y, float(lens_type.open)), axis=1)
+        moved = np.abs(edges - corner[:, None] - float(lens_type.footprint) / 2 * np.array([-1.0, 1.0])).max()
         reach = max(reach, wide / camera.target_pitch + float(moved))
     return ceil(reach) + 1
 

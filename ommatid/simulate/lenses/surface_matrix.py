@@ -59,7 +59,7 @@ def matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     entries, total = next(parts)
     for more, light in parts:
         entries, total = sparse.csr_array(entries + more), total + light
-    scale = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
+    scale = np.divide(float(lens_type.light), total, out=np.zeros_like(total), where=total > 0)
     return sparse.csr_array(sparse.diags_array(scale) @ entries)
 
 
@@ -76,7 +76,7 @@ def _band(
 
 def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _PixelFootprints:
     parts: list[FloatArray] = []
-    half = camera.pixel_pitch / 2
+    half = camera.pixel_pitch / 2 * float(lens_type.open)
     for sub in camera.sub_imagers:
         if sub.type != lens_type:
             continue

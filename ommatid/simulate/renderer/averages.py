@@ -29,7 +29,8 @@ class Averages:
         import drjit as dr
         import mitsuba as mi
 
-        self._camera, self._box, self._parts = camera, lens_type.ratio.numerator, lens_type.ratio.denominator
+        side = lens_type.footprint
+        self._camera, self._box, self._parts = camera, side.numerator, side.denominator
         fine: FloatArray = np.repeat(np.repeat(picture, self._parts, axis=0), self._parts, axis=1)
         means = np.full(self._box, 1 / self._box)
         moments = ((np.arange(self._box) + 0.5) / self._box - 0.5) / self._box

@@ -66,6 +66,7 @@ class RayGenerator:
         self._placement = MILLIMETRES_AT_ORIGIN
         self._loaded: tuple[slice, list[Any], Any] | None = None  # of the last block of all pixels
         self._pitch = float(camera.pixel_pitch)
+        self._open = float(types[0].open)  # of all of these types
         self._crossing = None
         if not camera.walls:
             from .crosstalk import Crosstalk
@@ -118,7 +119,7 @@ class RayGenerator:
     ) -> tuple[Rays, tuple[Any, Any]]:
         """Start rays as `sobol_rays` does, but from the middles of pixels; return the falloff across their pixels, too.
 
-        falloff : relative change of the weight from one edge of a ray's pixel to the other, down and across
+        falloff : relative change of the weight from one edge of a pixel's open part to the other, down and across
         """
         import drjit as dr
         import mitsuba as mi
@@ -131,7 +132,7 @@ class RayGenerator:
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, each)
         x, y, z = (dr.gather(mi.Float, row, index) for row in places[0][:3])
         x, y = x + self._pitch / 2, y + self._pitch / 2
-        slope = -4 * self._pitch / (x * x + y * y + z * z)  # of cos^4
+        slope = -4 * self._open * self._pitch / (x * x + y * y + z * z)  # of cos^4
         return ray, (slope * y, slope * x)
 
     def middles(self, pixels: IntArray) -> Rays:
@@ -175,13 +176,13 @@ class RayGenerator:
         return coordinates, own
 
     def _emit(self, places: tuple[list[Any], Any], each: int, lanes: int, at: Any, draws: Any) -> tuple[Any, Any]:
-        """Return Mitsuba's rays, `each` per pixel, from points `at` of pixels, each in [0, 1)^2, and their weights."""
+        """Return Mitsuba's rays, `each` per pixel, and their weights; at : in [0, 1)^2, points of the open parts."""
         import drjit as dr
         import mitsuba as mi
 
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, each)
         corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in places[0])
-        at = at * self._pitch
+        at = ((1 - self._open) / 2 + self._open * at) * self._pitch
         if axes:
             x = corner_x + axes[0] * at.x + axes[1] * at.y
             y = corner_y + axes[2] * at.x + axes[3] * at.y

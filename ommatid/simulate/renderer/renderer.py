@@ -337,6 +337,7 @@ class Renderer:
 
 def _groups(camera: Camera, together: bool) -> dict[str, tuple[LensType, ...]]:
     """Return the lens types that are rendered together, by a name."""
-    if together and all(lens_type.optics.is_pinhole for lens_type in camera.types):
+    alike = all(each.optics.is_pinhole and each.open == camera.types[0].open for each in camera.types)
+    if together and alike:
         return {"camera": camera.types}
     return {lens_type.name: (lens_type,) for lens_type in camera.types}

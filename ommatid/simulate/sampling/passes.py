@@ -172,21 +172,22 @@ def exact_plan(camera: Camera, index: int, sampler: Sampler, *, fast: bool = Tru
     fast : True if the averages of the picture over its pixels can be had, one a pass
     """
     sub = camera.sub_imagers[index]
-    ratio = sub.type.ratio
+    side = sub.type.footprint
     if sampler not in JITTERED or not sub.type.optics.is_pinhole:
         return None
-    ends = [float(start * ratio.denominator) for start in sub.window]
-    fits = ratio.numerator <= MOST_CELLS and all(end.is_integer() for end in ends)
+    ends = [(start + sub.type.inset) * side.denominator for start in sub.window]
+    ends.append(sub.type.ratio * side.denominator)  # the next pixel begins on the grid, too
+    fits = side.numerator <= MOST_CELLS and all(end.denominator == 1 for end in ends)
     is_ideal = camera.walls and camera.tolerance is None and not sub.rotation
     if fits and is_ideal and margin(camera, sub.type) <= WIDEST_MARGIN:
-        return Plan(EXACT_PASSES, ratio.numerator**2)
+        return Plan(EXACT_PASSES, side.numerator**2)
     return AVERAGED if fast and has_equal_boxes(camera, sub.type) else None
 
 
 def has_equal_boxes(camera: Camera, lens_type: LensType) -> bool:
     """Return True if all pixels of a lens type throw equal boxes along the axes of the picture, and not too large."""
-    ratio, tolerance = lens_type.ratio, camera.tolerance
-    small = ratio.numerator <= MOST_PIXELS and ratio.denominator <= MOST_PARTS
+    side, tolerance = lens_type.footprint, camera.tolerance
+    small = side.numerator <= MOST_PIXELS and side.denominator <= MOST_PARTS
     displaced = tolerance is not None and tolerance.displaces and lens_type.optics.is_pinhole
     straight = camera.walls and not lens_type.is_rotated and (tolerance is None or displaced)
     return small and straight and lens_type.optics.surfaces is None and lens_type.optics.distortion is None
@@ -196,4 +197,4 @@ def margin(camera: Camera, lens_type: LensType) -> float:
     """Return by how much of a cell rounding may move the point of the target that a ray of a lens type meets."""
     away = max(abs(place) for sub in camera.sub_imagers for place in sub.lens)
     extent = max(camera.shape) + away / camera.target_pitch  # pixels of f
-    return ROUNDINGS * ROUNDING * extent * lens_type.ratio.denominator
+    return ROUNDINGS * ROUNDING * extent * lens_type.footprint.denominator

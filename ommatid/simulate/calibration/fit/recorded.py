@@ -59,5 +59,7 @@ def _responses(model: Model) -> Responses:
         errors += rng.normal(size=(DRAWS, model.measurements))[:, rows] * shared
     errors = DRAWS**0.5 * (errors - errors.mean(axis=0))
     starts = np.concatenate([[0], np.cumsum(np.where(unknown, 0, lengths))])
-    measured = sparse.csr_array((matrix.data[kept], matrix.indices[kept], starts), shape=matrix.shape)
-    return Responses(DRAWS, 1, "", 0, measured, model.variance[kept], errors[:, kept].astype(np.float32))
+    received = model.camera.received[rows][kept]
+    measured = sparse.csr_array((matrix.data[kept] / received, matrix.indices[kept], starts), shape=matrix.shape)
+    batches = (errors[:, kept] / received).astype(np.float32)
+    return Responses(DRAWS, 1, "", 0, measured, model.variance[kept] / np.square(received), batches)

@@ -88,7 +88,7 @@ def _intervals(camera: Camera, sub: SubImager, numbers: FloatArray, chart: Chart
     moved = (numbers - designed(sub)) * (np.arange(numbers.size) != MAGNIFICATION)
     rows, columns = (each @ moved for each in displacements(camera, sub, (chart.down, chart.across)))
     growth = 1 + float(numbers[MAGNIFICATION])
-    middle, width = sub.type.middle(sub.window), float(sub.type.ratio) / growth
+    middle, width = sub.type.middle(sub.window), float(sub.type.footprint) / growth
     starts = [
         centre + offset / growth + move - width / 2
         for centre, offset, move in zip(middle, (down, across), (rows, columns), strict=True)
@@ -116,8 +116,9 @@ def _exact(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows
 
 
 def _rows(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> sparse.csr_array:
-    """Return the exact rows of H of the chart's pixels: (pixels, N)."""
-    return entries(camera, sub, numbers)[(chart.down * sub.type.pixels[1] + chart.across).astype(np.int64)]
+    """Return the exact rows of H of the chart's pixels, over the light that they receive: (pixels, N)."""
+    rows = entries(camera, sub, numbers)[(chart.down * sub.type.pixels[1] + chart.across).astype(np.int64)]
+    return sparse.csr_array(rows / float(sub.type.light))
 
 
 def _expected(

@@ -1,0 +1,167 @@
+"""Pixels that are open in part: H in closed form against that of finer pixels, rendered light and calibrations."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ommatid.reconstruct.restore import restore
+from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.fitted.view import COUNT, MAGNIFICATION, real_box
+from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.setup import Setup
+from ommatid.simulate.calibrate import calibrate
+from ommatid.simulate.ideal import designed_kernels, ideal_matrix, ideal_model, true_matrix
+from ommatid.simulate.render import render
+
+from ..examples import THREE, Lenses, assert_student, needs, scene, with_optics
+from ..frames import assert_methods_agree, recorded, wide
+from ..lenses import BICONVEX
+
+SHAPE = (25, 25)
+LENS: Lenses = (("1/3", [2, 2], [6, 6]),)
+FINE: Lenses = (("1", [2, 2], [18, 18]),)
+ROOM = {"lens_pitch": "1 mm"}
+OPTICS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "pinholes": ({}, {}),
+    "rotated": ({}, {"tolerance": {"rotation": "2 deg", "position": "2 um"}}),
+    "distorted": ({"distortion": [0.05, 0.0]}, {}),
+    "diffracting": ({"aperture": "0.4 mm"}, {}),
+    "out of focus": ({"aperture": "0.4 mm", "focus": "0.7 m"}, {"wavelength": "none"}),
+    "surfaces": ({"surfaces": BICONVEX, "scale": "fit"}, {}),
+}
+SLOW = pytest.mark.slow
+SLOW_SURFACES = [*OPTICS][:-1] + [pytest.param("surfaces", marks=SLOW)]
+
+
+def divided(name: str) -> Camera:
+    """The same camera with pixels a third as wide, all open, at the same places of the sensor."""
+    lens, table = OPTICS[name]
+    _, camera = with_optics(lens, ROOM | table | {"pixel_pitch": "2 um"}, FINE, SHAPE)
+    return camera
+
+
+def opened(name: str, part: str, light: str = "lost") -> tuple[Scene, Camera]:
+    """A camera whose pixels are open in part."""
+    lens, table = OPTICS[name]
+    return with_optics(lens, ROOM | table | {"fill_factor": part, "fill_light": light}, LENS, SHAPE)
+
+
+@pytest.mark.parametrize("name", SLOW_SURFACES)
+def test_the_open_third_of_a_pixel_is_the_middle_one_of_nine_pixels(name: str) -> None:
+    """Whatever the lens: the pixels a third as wide have a closed form of their own."""
+    fine = true_matrix(divided(name)).toarray().reshape(4, 18, 18, -1)[:, 1::3, 1::3].reshape(144, -1)
+    for light, share in (("lost", 1 / 9), ("kept", 1.0)):
+        found = true_matrix(opened(name, "1/3", light)[1]).toarray()
+        np.testing.assert_allclose(found, share * fine, atol=share * (2e-4 if name == "surfaces" else 1e-9))
+
+
+@pytest.mark.parametrize(("ratio", "part"), [("1/3", "2/3"), ("2/5", "1/2"), ("1/4", "7/10")])
+def test_a_box_of_any_side_is_a_mean_of_points(ratio: str, part: str) -> None:
+    described = scene((19, 19), ((ratio, [2, 2], [3, 3]),))
+    data = described.plain()
+    data["camera"]["fill_factor"] = part
+    camera = derive(parse(data, Path("test.toml")))
+    (lens,), points = camera.types, (np.arange(2000) + 0.5) / 2000
+    open_part = float(Fraction(part))
+    expected = np.zeros((2, 3, 19))
+    for k, i in np.ndindex(2, 3):
+        places = float(lens.starts(0)[k]) + float(lens.ratio) * (i + (1 - open_part) / 2 + open_part * points)
+        expected[k, i] = np.bincount(places.astype(int), minlength=19) / points.size
+    matrix = ideal_matrix(camera).toarray().reshape(2, 2, 3, 3, 19, 19)
+    both = np.einsum("kia,ljb->klijab", expected, expected) * open_part**2
+    np.testing.assert_allclose(matrix, both, atol=2e-3 * open_part**2)
+    moved = np.zeros(COUNT)
+    moved[MAGNIFICATION] = 1e-9  # which leaves the integers of designed boxes
+    displaced = [real_box(camera.shape, sub, moved).to_sparse().toarray() for sub in camera.sub_imagers]
+    np.testing.assert_allclose(np.concatenate(displaced), ideal_matrix(camera).toarray(), atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["diffracting", SLOW_SURFACES[-1]])
+def test_kernels_are_the_entries(name: str) -> None:
+    _, camera = opened(name, "2/3")
+    kernels = designed_kernels(camera, camera.types[0]).to_sparse().toarray()
+    exact = ideal_matrix(camera).toarray()
+    assert np.abs(kernels - exact).max() < 4e-3 * exact.max()
+    assert exact.sum(axis=1).max() <= 4 / 9 + 1e-9
+
+
+@pytest.mark.parametrize("part", [pytest.param("1/2", marks=SLOW), "2/3"])
+@pytest.mark.parametrize("name", SLOW_SURFACES)
+def test_rays_measure_the_closed_form(name: str, part: str) -> None:
+    """Entry by entry: squared errors over their variances have mean 1.
+
+    But for what closed forms of blur neglect, the variation of the light's weight within a pixel: up to 1.25 here.
+    """
+    needs("llvm_ad_mono")
+    lens, table = OPTICS[name]
+    samples = {"samples": 2048, "method": "transport", "fit": "none"}
+    optics = ROOM | table | {"fill_factor": part}
+    described, camera = with_optics(lens, optics, LENS, SHAPE, calibration=samples, render={"sampler": "independent"})
+    model = calibrate(Setup.from_scene(described))
+    difference = (model.matrix - true_matrix(camera)).toarray()
+    at = np.repeat(np.arange(144), np.diff(model.matrix.indptr)), model.matrix.indices
+    likely = model.matrix.data > 0.02 * model.matrix.data.max()  # the others are hit by few rays
+    assert_student(difference[at][likely], model.variance[likely], model.record["passes"])
+    scores = np.square(difference[at][likely]) / model.variance[likely]
+    assert 0.85 < scores.mean() < 1.3
+
+
+@pytest.mark.parametrize("name", ["pinholes", *(pytest.param(each, marks=SLOW) for each in ("rotated", "diffracting"))])
+def test_a_camera_is_rendered_and_calibrated_as_it_is(name: str) -> None:
+    """By few numbers, with "auto": the readings are those of the closed form, and the error is the expected one."""
+    needs("llvm_ad_mono")
+    lens, table = OPTICS[name]
+    auto = {"noise": {"variance": 1e-2}, "render": {"samples": "auto"}, "prior": {"kind": "fit"}}
+    calibration = {"samples": 4096, "fit": "auto"}
+    optics = ROOM | table | {"fill_factor": "2/3"}
+    described, camera = with_optics(lens, optics, THREE, SHAPE, calibration=calibration, **auto)
+    setup = Setup.from_scene(described)
+    stack, model = render(setup), calibrate(setup)
+    exact = true_matrix(camera)
+    assert not model.record["fit"]["refused"]
+    scale = np.sqrt(np.square(exact.data).mean())
+    assert np.sqrt(np.square((model.to_sparse() - exact).toarray()).sum() / exact.nnz) < 0.03 * scale
+    noise = stack.values - exact @ setup.image.ravel()
+    assert np.square(noise).mean() == pytest.approx(1e-2, rel=0.2)
+    done = restore(stack, model, setup.image.ravel())
+    assert done.verdict.level == "green"
+    assert done.result.interval is not None
+    assert done.error is not None
+    assert done.result.interval.low <= done.error.mse <= done.result.interval.high
+
+
+@pytest.mark.parametrize("part", ["1/3", "1/2", pytest.param("2/3", marks=SLOW)])
+def test_frames_of_open_parts_have_the_error_bars_of_dense_matrices(part: str) -> None:
+    def described(method: str) -> Scene:
+        made = wide((41, 38), calibration={"method": "ideal"}, noise={"variance": 1e-2}, estimator={"method": method})
+        return made.model_copy(update={"camera": made.camera.model_copy(update={"fill_factor": Fraction(part)})})
+
+    assert_methods_agree(described, ["frame"], 0.02)
+
+
+def test_a_uniform_target_reads_what_the_open_part_receives() -> None:
+    for light, value in (("lost", 100 / 9), ("kept", 100.0)):
+        described, camera = opened("pinholes", "1/3", light)
+        stack = recorded(described, np.full(camera.unknowns, 100.0), 0.0)
+        np.testing.assert_allclose(stack.values, value)
+        assert ideal_model(described, camera).applied.forward(np.ones(camera.unknowns)) == pytest.approx(value / 100)
+
+
+@pytest.mark.parametrize("part", ["0", "3/2", "1/101", "wide"])
+def test_other_fill_factors_are_refused(part: str) -> None:
+    with pytest.raises(InputError, match="fill_factor"):
+        opened("pinholes", part)
+
+
+def test_the_scalar_backend_is_refused() -> None:
+    needs("scalar_rgb")
+    described, _ = opened("pinholes", "1/3")
+    scalar = described.model_copy(update={"render": described.render.model_copy(update={"variant": "scalar_rgb"})})
+    with pytest.raises(InputError, match=r"camera\.fill_factor below 1 needs Mitsuba's fast backend"):
+        render(Setup.from_scene(scalar))

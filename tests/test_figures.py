@@ -51,6 +51,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/camera.md", "The gallery"): "runs of the large scenes, minutes each",
     ("docs/choose-a-camera.md", "Describe the sensor and one lens"): "lengths of the example",
     ("docs/choose-a-camera.md", "What diffraction allows"): "lengths of the example",
+    ("docs/choose-a-camera.md", "Masks, or more lens types"): "predictions of 119 x 119 pixels, half a minute each",
     ("docs/diffraction.md", "One wavefront"): "constants of the text",
     ("docs/diffraction.md", "Which f-number"): "f-numbers",
     ("docs/lenses.md", "A real lens"): "an experiment against the closed form, 65,536 rays of every pixel",

@@ -117,7 +117,8 @@ def test_a_camera_is_rendered_and_calibrated_as_it_is(name: str) -> None:
     """By few numbers, with "auto": the readings are those of the closed form, and the error is the expected one."""
     needs("llvm_ad_mono")
     lens, table = OPTICS[name]
-    auto = {"noise": {"variance": 1e-2}, "render": {"samples": "auto"}, "prior": {"kind": "fit"}}
+    variance = 1.0 if name == "diffracting" else 1e-2  # which takes fewer rays
+    auto = {"noise": {"variance": variance}, "render": {"samples": "auto"}, "prior": {"kind": "fit"}}
     calibration = {"samples": 4096, "fit": "auto"}
     optics = ROOM | table | {"fill_factor": "2/3"}
     described, camera = with_optics(lens, optics, THREE, SHAPE, calibration=calibration, **auto)
@@ -128,7 +129,7 @@ def test_a_camera_is_rendered_and_calibrated_as_it_is(name: str) -> None:
     scale = np.sqrt(np.square(exact.data).mean())
     assert np.sqrt(np.square((model.to_sparse() - exact).toarray()).sum() / exact.nnz) < 0.03 * scale
     noise = stack.values - exact @ setup.image.ravel()
-    assert np.square(noise).mean() == pytest.approx(1e-2, rel=0.2)
+    assert np.square(noise).mean() == pytest.approx(variance, rel=0.2)
     done = restore(stack, model, setup.image.ravel())
     assert done.verdict.level == "green"
     assert done.result.interval is not None
@@ -153,7 +154,7 @@ def test_a_uniform_target_reads_what_the_open_part_receives() -> None:
         assert ideal_model(described, camera).applied.forward(np.ones(camera.unknowns)) == pytest.approx(value / 100)
 
 
-@pytest.mark.parametrize("part", ["0", "3/2", "1/101", "wide"])
+@pytest.mark.parametrize("part", ["0", "3/2", "1/21", "wide"])
 def test_other_fill_factors_are_refused(part: str) -> None:
     with pytest.raises(InputError, match="fill_factor"):
         opened("pinholes", part)

@@ -40,7 +40,7 @@ FACTORS = {  # of the commonest units, to the last bit as pint has them; pint ta
 }
 LONGEST_NAME, LONGEST_PATH = 255, 4000  # bytes that file systems accept
 LARGEST_VARIANCE = 1e24
-FINEST_PART = 100  # of the side of a sensor pixel, into which exact areas of its open part divide it
+FINEST_PART = 20  # of the side of a sensor pixel: exact areas of rotated pixels divide it
 FEWEST_SAMPLES, MOST_SAMPLES = 16, 2**24
 AUTO = "auto"  # samples: as many as needed
 

@@ -141,7 +141,7 @@ class Camera:
         return self.walls and not (bent or self.is_blurred(lens_type))
 
     def has_kernel(self, lens_type: LensType) -> bool:
-        """True if the designed H of a lens type may be a few kernels: a blurred one whose pixels all cut those of f alike.
+        """True if the designed H of a lens type may be a few kernels: it is blurred, and its pixels are aligned.
 
         Kernels of surfaces are traced, and held by a model; distortion of more than a pixel or so is not held by them.
         """
@@ -205,7 +205,10 @@ class Camera:
     @property
     def received(self) -> FloatArray:
         """Share of the light on each sensor pixel that its open part receives: (M,)."""
-        return np.repeat([float(each.light) for each in self.types], [each.measurements for each in self.types])
+        shares = [float(each.light) for each in self.types]
+        if all(share == 1 for share in shares):
+            return np.broadcast_to(1.0, self.measurements)
+        return np.repeat(shares, [each.measurements for each in self.types])
 
     @cached_property
     def sub_imagers(self) -> tuple[SubImager, ...]:

@@ -36,7 +36,7 @@ OPTICS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "surfaces": ({"surfaces": BICONVEX, "scale": "fit"}, {}),
 }
 SLOW = pytest.mark.slow
-SLOW_SURFACES = [*OPTICS][:-1] + [pytest.param("surfaces", marks=SLOW)]
+SLOW_SURFACES = [*[*OPTICS][:-1], pytest.param("surfaces", marks=SLOW)]
 
 
 def divided(name: str) -> Camera:

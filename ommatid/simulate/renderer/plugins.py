@@ -150,7 +150,7 @@ def export(setup: Setup, path: Path) -> Path:
     scene, camera = setup.scene, setup.world.camera
     if not camera.is_ideal_pinhole or any(lens_type.open != 1 for lens_type in camera.types):
         raise InputError(
-            f"{scene.source}: stock sensors of Mitsuba are pinholes at their designed positions whose pixels are all open,"
+            f"{scene.source}: stock sensors of Mitsuba are pinholes at their designed positions with pixels all open,"
             " so other lenses, a [camera.tolerance] or a fill factor cannot be exported; remove them with --set"
         )
     if path.suffix != ".xml":

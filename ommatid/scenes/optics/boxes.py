@@ -24,9 +24,7 @@ if TYPE_CHECKING:
     from ..camera import Camera
 
 
-def overlap(
-    ratio: Fraction, pixels: int, start: Fraction, size: int, part: Fraction = Fraction(1)
-) -> sparse.csr_array:
+def overlap(ratio: Fraction, pixels: int, start: Fraction, size: int, part: Fraction = Fraction(1)) -> sparse.csr_array:
     """Shares of `size` unit cells in `pixels` adjacent intervals of length `ratio` from `start` on: (pixels, size).
 
     part : of each interval, in its middle, that counts

@@ -131,6 +131,11 @@ class Camera:
         return self.tolerance is None and all(lens.optics.is_pinhole and not lens.is_rotated for lens in self.types)
 
     @property
+    def has_stock_sensors(self) -> bool:
+        """True if Mitsuba's own sensors render it: ideal pinholes before pixels that are all open."""
+        return self.is_ideal_pinhole and all(lens_type.open == 1 for lens_type in self.types)
+
+    @property
     def has_box_footprints(self) -> bool:
         """True if the designed H averages f over boxes: without distortion, rotation and blur, and with walls."""
         return all(self.has_boxes(lens_type) for lens_type in self.types)

@@ -168,9 +168,10 @@ class Model:
         """Variance that the uncertainty of H adds to each measurement of `image`: (M,).
 
         The errors of a row cancel in its sum, since all its entries share their rays, so the rest is about
-        sum over j of var_ij (f_j - (H f)_i)^2; light that is lost beside the target is one more entry, where f is 0.
-        Errors of neighbouring entries cancel too where the image is smooth; the scatter of H f over the batches, shrunk
-        among pixels of a lens type with similar contrast, shows by how much.
+        sum over j of var_ij (f_j - m_i)^2, m_i the mean that the open part of pixel i sees; light that is lost beside
+        the target is one more entry, where f is 0. Errors of neighbouring entries cancel too where the image is
+        smooth; the scatter of H f over the batches, shrunk among pixels of a lens type with similar contrast, shows by
+        how much.
         Entries of recorded points were measured one by one, and nothing cancels: sum over j of var_ij f_j^2, and the
         square of the sum of what they share.
 
@@ -183,7 +184,7 @@ class Model:
         level = self.matrix @ flat
         if self.record["method"] == RECORDED:
             return self._row_sums(self.variance * contrast**2) + self._shared_variance(contrast)
-        level = level / self.camera.received  # mean over the open part of a pixel
+        level = level / self.camera.received
         variance = self._row_sums(self.variance * (contrast - level[self._rows]) ** 2)
         count = len(self.batches)
         if count < 2:

@@ -13,7 +13,8 @@ from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.fitted.view import COUNT, MAGNIFICATION, real_box
-from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.hardware.frames import AcquisitionSettings, read_frames
+from ommatid.scenes.scene import Scene, parse, read
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import designed_kernels, ideal_matrix, ideal_model, true_matrix
@@ -22,6 +23,7 @@ from ommatid.simulate.render import render
 from ..examples import THREE, Lenses, assert_student, needs, scene, with_optics
 from ..frames import assert_methods_agree, recorded, wide
 from ..lenses import BICONVEX
+from ..scenes.mosaics import NOISE, SCENE, as_mosaic
 
 SHAPE = (25, 25)
 LENS: Lenses = (("1/3", [2, 2], [6, 6]),)
@@ -109,7 +111,8 @@ def test_rays_measure_the_closed_form(name: str, part: str) -> None:
     likely = model.matrix.data > 0.02 * model.matrix.data.max()  # the others are hit by few rays
     assert_student(difference[at][likely], model.variance[likely], model.record["passes"])
     scores = np.square(difference[at][likely]) / model.variance[likely]
-    assert 0.85 < scores.mean() < 1.3
+    error, neglected = 4 * scores.std(ddof=1) / scores.size**0.5, 0.25 * camera.is_blurred(camera.types[0])
+    assert 1 - error < scores.mean() < 1 + error + neglected
 
 
 @pytest.mark.parametrize("name", ["pinholes", *(pytest.param(each, marks=SLOW) for each in ("rotated", "diffracting"))])
@@ -154,6 +157,20 @@ def test_a_uniform_target_reads_what_the_open_part_receives() -> None:
         assert ideal_model(described, camera).applied.forward(np.ones(camera.unknowns)) == pytest.approx(value / 100)
 
 
+def test_flat_frames_are_seen_through_the_same_openings(tmp_path: Path) -> None:
+    """Readings of a recorded picture are those of H, whatever the gain; a flat frame shows a value of 200."""
+    path = tmp_path / "scene.toml"
+    path.write_text((SCENE + NOISE).replace("[camera]", '[camera]\nfill_factor = "1/3"', 1), encoding="utf-8")
+    camera = derive(read(path))
+    readings = ideal_matrix(camera) @ np.random.default_rng(0).uniform(0, 255, camera.unknowns)
+    flat = ideal_matrix(camera) @ np.full(camera.unknowns, 200.0)
+    for name, values in (("image", readings), ("flat", flat)):
+        np.save(tmp_path / f"{name}.npy", as_mosaic(camera, 7.0 * values).astype(np.float32))
+    settings = AcquisitionSettings(flat=(tmp_path / "flat.npy",), flat_value=200.0)
+    found = read_frames(camera, [tmp_path / "image.npy"], settings, mosaics=True).values()
+    np.testing.assert_allclose(found[0], readings, rtol=1e-5)
+
+
 @pytest.mark.parametrize("part", ["0", "3/2", "1/21", "wide"])
 def test_other_fill_factors_are_refused(part: str) -> None:
     with pytest.raises(InputError, match="fill_factor"):
@@ -164,5 +181,5 @@ def test_the_scalar_backend_is_refused() -> None:
     needs("scalar_rgb")
     described, _ = opened("pinholes", "1/3")
     scalar = described.model_copy(update={"render": described.render.model_copy(update={"variant": "scalar_rgb"})})
-    with pytest.raises(InputError, match=r"camera\.fill_factor below 1 needs Mitsuba's fast backend"):
+    with pytest.raises(InputError, match=r"camera\.fill_factor below 1, need Mitsuba's fast backend"):
         render(Setup.from_scene(scalar))

@@ -218,9 +218,10 @@ class FrameMethod(Method):
         mean = np.zeros(task.model.unknowns)
         inputs = ResidualInputs(lambda image: image, task.draw_deviation, actual, mean, draws, leverage, total=total)
         columns = inputs.columns()
-        of_mean, of_noise = map(self._residual_of, islice(columns, 1)), map(self._residual, islice(columns, draws))
-        power = inputs.power(chain(of_mean, of_noise, map(self._residual_of, columns)), task.expected_noise)
-        return replace(power, bias=None)  # 0 for f0; that of another image takes its place
+        next(columns)  # f0, of which no residual is left; the bias of another image takes its place
+        residuals = chain([np.zeros(actual.size)], map(self._residual, islice(columns, draws)))
+        power = inputs.power(chain(residuals, map(self._residual_of, columns)), task.expected_noise)
+        return replace(power, bias=None)
 
     def _residual_power(self, power: ResidualPower, deviation: FloatArray | None) -> ResidualPower:
         """Return the expected squares of the residual for the true image f0 + `deviation`, (N,), if it is known."""

@@ -210,6 +210,11 @@ class RecordedFrames:
         return self.dark, self.flat
 
     @property
+    def flat_values(self) -> FloatArray:
+        """Readings of the uniform target in the flat frames, in units of f: (M,)."""
+        return self.settings.flat_value * self.layout.camera.received
+
+    @property
     def scale(self) -> FloatArray:
         """Units of f per digital number, (M,); NaN for dead pixels."""
         if self.flat is None:
@@ -218,11 +223,11 @@ class RecordedFrames:
             signal: FloatArray = self.flat if self.dark is None else self.flat - self.dark
         alive = np.isfinite(signal) & (signal > 0)
         scale: FloatArray = np.full(signal.shape, np.nan)
-        scale[alive] = self.settings.flat_value / signal[alive]
+        scale[alive] = self.flat_values[alive] / signal[alive]
         return scale
 
     def values(self) -> FloatArray:
-        """(image - dark) / (flat - dark) flat_value, NaN for dead pixels: (exposures, M)."""
+        """(image - dark) / (flat - dark) flat_values, NaN for dead pixels: (exposures, M)."""
         with np.errstate(over="ignore", invalid="ignore"):
             values: FloatArray = (self.numbers if self.dark is None else self.numbers - self.dark) * self.scale
         values[~(np.abs(values) <= LARGEST_NUMBER)] = np.nan
@@ -365,7 +370,7 @@ def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Rec
     if frames.averaged > 1:
         sensor = sensor.model_copy(update={"frames": frames.averaged})
     digital, dark, flat = (_as_float32(values) for values in (frames.numbers[0], dark, flat))
-    return Recording(sensor, digital, dark, flat, np.full(digital.size, frames.settings.flat_value))
+    return Recording(sensor, digital, dark, flat, frames.flat_values)
 
 
 def _as_float32(values: FloatArray) -> FloatArray:

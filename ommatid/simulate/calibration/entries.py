@@ -71,8 +71,8 @@ def rendered_model(
         model = fitted_model(setup.resolved, camera, fit.matrix, rest, record)
     else:
         responses = measure(None)
-        variance = entry_variances(responses, camera)
-        rows = _received(camera, MeasuredRows(responses.matrix, variance, responses.batches))
+        measured = MeasuredRows(responses.matrix, entry_variances(responses, camera), responses.batches)
+        rows = _received(camera, measured)
         record |= responses.record()
         model = Model(setup.resolved, camera, rows.matrix, rows.variance, rows.batches, record)
     seconds = perf_counter() - start

@@ -148,7 +148,7 @@ def export(setup: Setup, path: Path) -> Path:
     .xml; MachineError for a full disk.
     """
     scene, camera = setup.scene, setup.world.camera
-    if not camera.is_ideal_pinhole or any(lens_type.open != 1 for lens_type in camera.types):
+    if not camera.has_stock_sensors:
         raise InputError(
             f"{scene.source}: stock sensors of Mitsuba are pinholes at their designed positions with pixels all open,"
             " so other lenses, a [camera.tolerance] or a fill factor cannot be exported; remove them with --set"

@@ -143,12 +143,11 @@ def choose(requested: str) -> str:
 
 def check_fast_variant(camera: Camera, variant: str) -> None:
     """Raise InputError if a camera has lenses or fill factors that Mitsuba's scalar backend does not render."""
-    if not variant.startswith("scalar"):
-        return
-    if not camera.is_ideal_pinhole:
-        raise InputError(f"lenses that are more than pinholes need Mitsuba's fast backend, got {variant}; {remedy()}")
-    if any(lens_type.open != 1 for lens_type in camera.types):
-        raise InputError(f"camera.fill_factor below 1 needs Mitsuba's fast backend, got {variant}; {remedy()}")
+    if variant.startswith("scalar") and not camera.has_stock_sensors:
+        raise InputError(
+            "lenses that are more than pinholes, and a camera.fill_factor below 1, need Mitsuba's fast backend, got"
+            f" {variant}; {remedy()}"
+        )
 
 
 def check_transport_variant(variant: str, key: str = "calibration.method") -> None:

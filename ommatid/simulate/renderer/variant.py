@@ -145,8 +145,8 @@ def check_fast_variant(camera: Camera, variant: str) -> None:
     """Raise InputError if a camera has lenses or fill factors that Mitsuba's scalar backend does not render."""
     if variant.startswith("scalar") and not camera.has_stock_sensors:
         raise InputError(
-            "lenses that are more than pinholes, and a camera.fill_factor below 1, need Mitsuba's fast backend, got"
-            f" {variant}; {remedy()}"
+            "a camera.fill_factor below 1 and"
+            f" lenses that are more than pinholes need Mitsuba's fast backend, got {variant}; {remedy()}"
         )
 
 

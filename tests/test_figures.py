@@ -36,6 +36,7 @@ needs_fast_backend = pytest.mark.skipif(bool(unusable_reason("llvm_ad_mono")), r
 NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("README.md", "Two commands"): "the version of Python",
     ("docs/install.md", "Install"): "the version of Python",
+    ("docs/install.md", "The fast backend"): "measured once on a machine with a graphics card",
     ("docs/speed.md", None): "times and ratios of `make bench`",
     ("docs/batches.md", "Many frames of one camera"): "ratios of times, measured once",
     ("docs/equations.md", "The noise"): "constants of the text",

@@ -105,10 +105,14 @@ def is_similarity(linear: FloatArray) -> bool:
     return square > 0 and float(np.abs(gram - square * np.eye(3)).max()) <= 2 * UNLIKE * square
 
 
+def _plain_transform(numbers: tuple[float, ...]) -> list[float]:
+    return list(numbers)  # `list[float]` itself as a serializer fails where Python knows a signature of it (3.12.3)
+
+
 Transform = Annotated[
     tuple[float, ...],
     BeforeValidator(_transform),
-    PlainSerializer(list[float]),
+    PlainSerializer(_plain_transform),
     WithJsonSchema(
         {
             "type": "array",

@@ -53,13 +53,16 @@ class Rendering(OverPasses):
     direct_only: bool
 
     def stated_variance(self, camera: Camera) -> FloatArray:
-        """Return the variance, (M,), shrunk among pixels with like neighbours, and never below float32's rounding."""
-        stated = np.empty_like(self.variance)
+        """Return the variance, (M,), shrunk among pixels with like neighbours, and never below float32's rounding.
+
+        It is 0 of pixels that no light reaches, whose reading is not a number.
+        """
+        stated, known = np.empty_like(self.variance), np.nan_to_num(self.variance, nan=0.0)
         for lens_type, rows in zip(camera.types, camera.type_slices(), strict=True):
-            images = self.variance[rows].reshape(lens_type.count, *lens_type.pixels)
+            images = known[rows].reshape(lens_type.count, *lens_type.pixels)
             around = np.concatenate([mean_of_neighbours(image).ravel() for image in images])
-            shrunk = posterior_variances_among(self.variance[rows], around, self.passes)
-            stated[rows] = np.maximum(shrunk, rounding_variance(self.mean[rows], self.samples))
+            shrunk = posterior_variances_among(known[rows], around, self.passes)
+            stated[rows] = np.maximum(shrunk, rounding_variance(np.nan_to_num(self.mean[rows], nan=0.0), self.samples))
         return stated
 
 

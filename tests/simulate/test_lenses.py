@@ -68,13 +68,14 @@ def test_the_measured_error_is_the_expected_one(lens: dict[str, Any], tables: di
     assert found.interval.low < found.error.mse < found.interval.high
 
 
-@pytest.mark.slow
-def test_pixels_that_no_light_can_reach_are_dead() -> None:
+def test_pixels_that_no_light_can_reach_are_dead(tmp_path: Path) -> None:
     """A baffle vignettes the corners of the field: NaN in the stack, empty rows of H, unused by the estimate."""
     needs("llvm_ad_mono")
     described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), "none", noise={"variance": 1.0})
     camera, truth = derive(described), load(described)
     stack, model = render(Setup(described, camera, truth)), calibrate(Setup(described, camera))
+    stacks.write(tmp_path / "stack.exr", stack)
+    np.testing.assert_array_equal(stacks.read(tmp_path / "stack.exr").values, stack.values.astype(np.float32))
     dark = np.isnan(stack.values)
     picture = dark.reshape(25, 25)
     assert picture[0, 0]

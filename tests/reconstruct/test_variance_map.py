@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,12 +14,14 @@ from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
 from ommatid.reconstruct.frame.error_map import ExactVariances, check_map, error_map
 from ommatid.reconstruct.frame.swept import swept_maps
 from ommatid.reconstruct.frame.variance_map import frame_map
-from ommatid.reconstruct.frame.windows import by_windows, windows_map
+from ommatid.reconstruct.frame.windows import Windows, by_windows, windows_map
 from ommatid.reconstruct.methods.method import EstimationTask
 from ommatid.reconstruct.prior import reflecting_root
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive
 from ommatid.scenes.fitted.kernels import KernelFootprints
+from ommatid.scenes.fitted.view import COUNT, real_box
+from ommatid.scenes.observation import Observation
 from ommatid.scenes.scene import Scene
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
@@ -129,6 +132,38 @@ def test_one_sweep_serves_any_h_and_any_noise() -> None:
     found = swept_maps(model.matrix, weights, np.ones(weights.size), 1 / P0, shape, model.windowed.reach)
     dense = precision(model.matrix, weights, 1 / P0)
     np.testing.assert_allclose(found[0].ravel(), np.diagonal(linalg.inv(dense)), rtol=1e-8)
+
+
+@pytest.mark.parametrize("case", ["even", "uneven", "unused", "as designed"])
+def test_windows_follow_from_one_with_the_same_footprints(case: str) -> None:
+    """Against every window's own solution, with noise that differs and a dead pixel, behind displaced pinholes.
+
+    As designed, footprints are the same at any place, though other sub-imagers see them.
+    """
+    types = ("1/3", [3, 3], "fit"), ("1/5", [5, 5], "fit") if case == "as designed" else ("1/4", [4, 4], "fit")
+    task, rng = task_of(wide((87, 99), types, **CORRELATED), 0.5), np.random.default_rng(0)
+    camera, observation = task.model.camera, task.model.applied
+    middles = np.array(camera.middles)
+    if case != "as designed":
+        numbers = [np.append(rng.uniform(-0.2, 0.2, 2), np.zeros(COUNT - 2)) for _ in camera.sub_imagers]
+        boxes = [real_box(camera.shape, sub, each) for sub, each in zip(camera.sub_imagers, numbers, strict=True)]
+        observation = Observation(camera.shape, tuple(boxes))
+    if case in ("uneven", "as designed"):
+        more = rng.uniform(1, 1.2, middles.shape[1]) * np.where(np.abs(middles[0] - 60) < 3, 8.0, 1.0)
+        task = replace(task, expected_noise=0.5 * more)
+    if case == "unused":
+        used = np.arange(middles.shape[1]) != int(np.argmin(np.square(middles - 42.2).sum(axis=0)))
+        task = replace(task, used=used, expected_noise=task.expected_noise[used])
+    windows = Windows(task, np.minimum(task.expected_noise, 0.55), (12, 12), 8)
+    with mock.patch.object(Windows, "map", autospec=True, side_effect=Windows.map) as mapped:
+        found = windows.frame(observation)
+    assert mapped.call_count < 8 * 9
+    with mock.patch("ommatid.reconstruct.frame.windows.REPEATS", 1000):
+        expected = windows.frame(observation)
+    accuracy = 1e-5 if case in ("even", "unused") else 3e-3
+    for one, other in ((found.posterior, expected.posterior), (found.variance, expected.variance)):
+        np.testing.assert_allclose(one, other, rtol=accuracy)
+    np.testing.assert_allclose(found.missing, expected.missing, rtol=10 * accuracy)
 
 
 UNEVEN = np.array([[1.0, 0.04, -0.02, -0.1, 0.02, -0.07]])  # a Legendre polynomial over the field

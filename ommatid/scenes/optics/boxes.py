@@ -23,6 +23,8 @@ from ..observation import Back, ObservationPart, Seen, on_lines, repetition
 if TYPE_CHECKING:
     from ..camera import Camera
 
+DIGITS = 12  # of shares that count as the same
+
 
 def overlap(ratio: Fraction, pixels: int, start: Fraction, size: int, part: Fraction = Fraction(1)) -> sparse.csr_array:
     """Shares of `size` unit cells in `pixels` adjacent intervals of length `ratio` from `start` on: (pixels, size).
@@ -126,7 +128,7 @@ class Box(ObservationPart):
         return sparse.csr_array(sparse.kron(down, across, format="csr"))
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
-        """A key that is equal for two windows only if their submatrices are equal."""
+        """A key that is equal for two windows only if their submatrices are, to `DIGITS`."""
         return _pattern(self.down, rows), _pattern(self.across, columns)
 
 
@@ -153,4 +155,5 @@ def _inside(axis: BoxAxis, window: slice) -> IntArray:
 
 def _pattern(axis: BoxAxis, window: slice) -> bytes:
     shares = axis.shares[_inside(axis, window)]
-    return shares.indptr.tobytes() + (shares.indices - window.start).tobytes() + shares.data.tobytes()
+    data = shares.data.round(DIGITS)  # those of displaced intervals are rounded otherwise everywhere
+    return shares.indptr.tobytes() + (shares.indices - window.start).tobytes() + data.tobytes()

@@ -47,7 +47,7 @@ Core = tuple[slice, ...]
 WHOLE = slice(None), slice(None)
 REPEATS = 5  # windows with the same footprints, from which one and how the others differ are faster than all
 PLACES = 6  # digits of places of readings, in pixels of f, beyond which they are rounded otherwise everywhere
-MOVED = 0.1  # change of a variance by other noise up to which it is known to a hundredth
+MOVED = 0.05  # change of a variance by other noise up to which it is known to a hundredth
 VARYING = 0.05  # variation of kernels from which windows count it; one of 0.09 makes a map 11 % wrong
 
 

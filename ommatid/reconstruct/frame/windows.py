@@ -162,9 +162,10 @@ class Windows:
             part if part.entries > MOST_ENTRIES else Entries(part.to_sparse(), part.shape) for part in observation.parts
         ]
         applied, (rows, columns) = Observation(observation.shape, tuple(parts)), self._stretches
-        down, across = (self._first_alike(observation, axis) for axis in (0, 1))
-        places, alike = list(product(rows, columns)), list(product(down, across))
-        shared = [first for first, count in Counter(alike).items() if count >= REPEATS and self._has_responses]
+        places, alike = list(product(rows, columns)), list(np.ndindex(len(rows), len(columns)))
+        if self.task.finer == 1 and not is_narrow(self.task):
+            alike = list(product(self._first_alike(observation, 0), self._first_alike(observation, 1)))
+        shared = [first for first, count in Counter(alike).items() if count >= REPEATS]
 
         def response(first: tuple[int, int]) -> Response:
             row, column = rows[first[0]], columns[first[1]]
@@ -172,24 +173,19 @@ class Windows:
 
         def at(place: tuple[Stretch, Stretch], first: tuple[int, int]) -> FloatArray:
             corner, core = (place[0].first, place[1].first), (place[0].core, place[1].core)
-            numbers = self._near(*self._window(corner))
-            numbers = numbers[self._order(numbers, corner)]
-            known = responses.get(first)
-            if known is not None and known.noise.size == numbers.size:
-                maps = known.maps(*(noise[numbers] for noise in self._noise))
-                if maps is not None:
-                    return maps
-            return self.map(applied, corner, core)
+            maps = None
+            if first in responses:
+                numbers = self._near(*self._window(corner))
+                numbers = numbers[self._order(numbers, corner)]
+                if responses[first].noise.size == numbers.size:  # unless one lies at an edge of the window, by rounding
+                    maps = responses[first].maps(*(noise[numbers] for noise in self._noise))
+            return self.map(applied, corner, core) if maps is None else maps
 
         with one_thread(), ThreadPoolExecutor(processors()) as threads:
             responses = dict(zip(shared, threads.map(response, shared), strict=True))
             found = list(threads.map(at, places, alike))
         lines = [found[first : first + len(columns)] for first in range(0, len(found), len(columns))]
         return VarianceMap(*np.block(lines))
-
-    @property
-    def _has_responses(self) -> bool:
-        return self.task.finer == 1 and not is_narrow(self.task)
 
     @cached_property
     def _noise(self) -> tuple[FloatArray, FloatArray]:
@@ -201,8 +197,8 @@ class Windows:
     def _even_noise(self) -> FloatArray:
         """Expected noise that is even over each lens type, as of most readings: (M,)."""
         parts = [self._noise[0][part] for part in self.task.model.camera.type_slices()]
-        medians = [float(np.median(part)) if np.isfinite(np.median(part)) else 1.0 for part in parts]
-        return np.repeat(medians, [part.size for part in parts])
+        medians = np.array([np.median(part) for part in parts])
+        return np.repeat(np.where(np.isfinite(medians), medians, 1.0), [part.size for part in parts])
 
     def _response(self, observation: Observation, corner: tuple[int, int], core: Core) -> Response:
         """Return the maps of the core of a window with even noise, and what they are for other noise."""
@@ -230,8 +226,7 @@ class Windows:
         camera = self.task.model.camera
         ends = [part.stop for part in camera.type_slices()]
         down, across = (
-            (middles[numbers] - first * self.task.finer).round(PLACES)
-            for middles, first in zip(camera.middles, corner, strict=True)
+            (middles[numbers] - first).round(PLACES) for middles, first in zip(camera.middles, corner, strict=True)
         )
         return np.lexsort((across, down, np.searchsorted(ends, numbers, "right")))
 

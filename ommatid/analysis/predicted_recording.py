@@ -1,4 +1,4 @@
-"""The recording that a scene would give, from H and a pilot's rays instead of a rendering.
+"""The recording that a scene would give, from H, with or without a pilot's rays, instead of a rendering.
 
 Its values are H f with noise of every cause: the rendering's, whose variance a pilot shows, and the sensor's. It is
 reconstructed like any other stack, so that a prediction knows of everything that a run does. Its seeds are its own.
@@ -16,6 +16,7 @@ from ommatid.reconstruct.prior_fit import fit_picture, natural_prior
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, derived_seed, stream
+from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import with_tables
@@ -67,6 +68,33 @@ class _Camera:
     assumes: Assumptions
 
 
+def recording_without_rays(setup: Setup) -> PredictedRecording:
+    """Return the recording by a perfect rendering, and the ideal H as its model; the prior is known.
+
+    Raises InputError where H has no closed form.
+    """
+    coarse = _with_own_seed(setup)
+    table, said_of_prior = prior_without_stack(coarse.calibrated)
+    coarse = replace(coarse, scene=with_tables(coarse.scene, prior=table))
+    setup = coarse.calibrated
+    _, image, truth, said = _image(coarse)
+    designed, camera, true = ideal_model(setup.scene, setup.camera), setup.camera, None
+    if camera.tolerance is not None and camera.has_sharp_footprints and camera.unknowns <= MOST_DENSE:
+        true = true_matrix(camera)
+    light = designed.forward(image) if true is None else true @ image
+    stack = exposed(coarse, light, np.zeros(light.size), {})
+    return PredictedRecording(stack, designed, true, designed, image, truth, (*said, *said_of_prior))
+
+
+def _image(coarse: Setup) -> tuple[FloatArray, FloatArray, FloatArray | None, Assumptions]:
+    """Return what is recorded on the grid of the world, (rows, columns), on that of H's columns, and the picture."""
+    truth, said = known_image(coarse.calibrated)
+    if truth is not None:
+        return coarse.world.image, truth, truth, said
+    world = _prior_draw(coarse.world).reshape(coarse.world.camera.shape)
+    return world, averaged(world, world.shape[0] // coarse.calibrated.camera.rows).ravel(), None, said
+
+
 def predicted_recording(setup: Setup) -> PredictedRecording:
     """Return the recording that a run of this scene would give, and its model of H.
 
@@ -74,9 +102,7 @@ def predicted_recording(setup: Setup) -> PredictedRecording:
     """
     coarse = _with_own_seed(setup)
     setup = coarse.calibrated
-    truth, said = known_image(setup)
-    world = coarse.world.image if truth is not None else _prior_draw(coarse.world).reshape(coarse.world.camera.shape)
-    image = averaged(world, world.shape[0] // setup.camera.rows).ravel() if truth is None else truth
+    world, image, truth, said = _image(coarse)
     camera = _camera(setup)
     variance, said_of_light = _rendering_variance(coarse, camera, image, world.ravel())
     rng = stream(setup.scene.render.seed, Purpose.PREDICTED_LIGHT)

@@ -1,8 +1,9 @@
 """The error that a run of a scene will have, from the recording that it would give.
 
-The recording is reconstructed as a run's is, with the same choice of methods, prior and noise. Where the estimator's H
-is not that of the camera which records, Eq. 5 gains what the difference brings: on average over assemblies within
-camera.tolerance, or of the lenses as they are.
+The recording is reconstructed as a run's is, with the same choice of methods, prior and noise. Without rays its image
+is known: the noise is that of this image, and of a frame whose lens types see the same everywhere transfer functions
+give the error. Where the estimator's H is not that of the camera which records, Eq. 5 gains what the difference brings:
+on average over assemblies within camera.tolerance, or of the lenses as they are.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ommatid.reconstruct.assumptions import Assumptions, assumptions_for, with_fallback
+from ommatid.reconstruct.assumptions import Assumptions, assumptions_at, assumptions_for, with_fallback
 from ommatid.reconstruct.coarse_model import model_of_f
+from ommatid.reconstruct.frame.windows import varies_over_field
 from ommatid.reconstruct.method_choice import METHODS, MethodChoice
 from ommatid.reconstruct.methods.dense_method import DenseMethod
 from ommatid.reconstruct.methods.method import Execution, MethodResult
@@ -23,21 +25,23 @@ from ommatid.reconstruct.misalignment.moments import (
     mismatch_of_image,
     mismatch_variance,
 )
+from ommatid.reconstruct.noise import undithered
 from ommatid.reconstruct.prediction import Prediction, observability
 from ommatid.reconstruct.prior import Prior
 from ommatid.reconstruct.restore import BUDGET, truth_for
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.optics.negligible import assumptions
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import PriorTable
 
-from .predicted_recording import PredictedRecording, predicted_recording
+from .predicted_recording import PredictedRecording, predicted_recording, recording_without_rays
 
 MODEL = "model"  # in the budget: H as designed is not that of the lenses
+BY_TRANSFER = "Eq. 5 by transfer functions, with edges, to 2 %"
+BY_MEANS = "Eq. 5 by transfer functions of the mean over each lens's field, to 5 %"
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,29 @@ def predict_run(setup: Setup) -> Prediction:
     )
 
 
+def predict_without_rays(setup: Setup, assumes: tuple[str, ...]) -> Prediction:
+    """Predict the error of a perfect rendering and the ideal H.
+
+    assumes : what is taken for granted, which the prediction says first
+    Raises InputError where H has no closed form.
+    """
+    recording = recording_without_rays(setup)
+    stack, model, said = recording.stack, recording.model, list(assumes)
+
+    def work(choice: MethodChoice) -> _Outcome:
+        quick = choice.method == "frame" and setup.camera.is_sliding and setup.camera.tolerance is None
+        assumed = assumptions_at(stack, model, choice, recording.image, Execution(quick=quick))
+        if quick and undithered(assumed.noise) is not None:
+            assumed = assumptions_at(stack, model, choice, recording.image, Execution())
+        elif quick:
+            said.append(BY_MEANS if varies_over_field(model.applied) else BY_TRANSFER)
+        truth = truth_for(assumed.method, recording.truth, stack.camera)
+        return _Outcome(choice, assumed, assumed.result(truth))
+
+    outcome = with_fallback(stack, model, work)
+    return _prediction(setup, replace(recording, assumes=(*said, *recording.assumes)), outcome)
+
+
 def _mse_with(setup: Setup, method: str, prediction: Prediction) -> float:
     """Return the error with H as designed or calibrated, of an estimator that takes it for exact."""
     scene = setup.scene
@@ -111,7 +138,7 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
     if mismatch is not None:
         budget[mismatch.cause] = float(mismatch.variance.mean())
     seen = None
-    if camera.unknowns <= MOST_DENSE:
+    if _dense(outcome):
         of_pixels = model_of_f(recording.certain, camera, PriorTable())
         seen = observability(of_pixels.matrix[outcome.assumed.usable.used])
     return Prediction.of(

@@ -21,7 +21,7 @@ SweepFolder = Annotated[
     Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the table and the plot of --sweep.")
 ]
 NoRays = Annotated[
-    bool, typer.Option("--no-rays", help="Ideal H and perfect rendering only: Eq. 5 in closed form, without any rays.")
+    bool, typer.Option("--no-rays", help="A perfect H and a perfect rendering for every scene: Eq. 5 without rays.")
 ]
 Candidates = Annotated[
     str, typer.Option("--candidates", metavar="1/M,...", help="Magnifications; dots continue the step before.")
@@ -41,7 +41,7 @@ def predict(
 ) -> None:
     """Predict the error, the rank and the null space of H.
 
-    From Eq. 5 and a few rays: no picture is rendered.
+    From Eq. 5, and a few rays where they matter: no picture is rendered.
     """
     asked = options.changes(sets), options.lens_names(lens)
     if sweep:

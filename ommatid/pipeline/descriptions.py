@@ -11,7 +11,7 @@ import numpy as np
 
 from ommatid.analysis import summary
 from ommatid.analysis.design import DesignCandidate, DesignComparison, with_lens
-from ommatid.analysis.predict import electrons, optics, predict_ideal
+from ommatid.analysis.predict import electrons, optics, predict_scene
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.progress import Progress
@@ -36,7 +36,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
 
 def compare_lens_types(scene: Scene, magnifications: Sequence[Fraction], progress: Progress) -> DesignComparison:
     """Predict the error of the scene with one more lens type of each magnification, with the ideal H."""
-    before, of_pixels = predict_ideal(scene), derive(scene).covers_whole_pixels
+    before, of_pixels = predict_scene(scene, rays=False), derive(scene).covers_whole_pixels
     candidates: list[DesignCandidate] = []
     for index, magnification in enumerate(magnifications):
         try:
@@ -46,7 +46,7 @@ def compare_lens_types(scene: Scene, magnifications: Sequence[Fraction], progres
                     "not ranked: its sensor pixels divide pixels of f, so its error depends on detail finer than f; set"
                     " target.detail and a correlated prior"
                 )
-            candidates.append(DesignCandidate(str(magnification), predict_ideal(wider)))
+            candidates.append(DesignCandidate(str(magnification), predict_scene(wider, rays=False)))
         except InputError as error:
             reason = str(error).removeprefix(f"{scene.source}: ")
             candidates.append(DesignCandidate(str(magnification), None, reason))

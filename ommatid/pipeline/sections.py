@@ -10,7 +10,7 @@ from math import sqrt
 from pathlib import Path
 from typing import Any
 
-from ommatid.analysis import depth_error, prediction_table, run_table, study, summary
+from ommatid.analysis import depth_error, predict, prediction_table, run_table, study, summary
 from ommatid.analysis.run_table import region_row
 from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
 from ommatid.reconstruct.output.verdict_words import grounds, heading, limit
@@ -45,9 +45,8 @@ def scene_sections(description: dict[str, Any]) -> list[Section]:
 def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, Any] | None) -> list[Section]:
     """Tabulate a prediction, and the electrons that the pixels collect where the scene has a sensor."""
     lines, tolerance = prediction_table.rows(prediction), scene.camera.tolerance
-    ideal_alone = prediction.budget is None or "rendering" not in prediction.budget  # no rays
     if (
-        ideal_alone
+        predict.LEFT_OUT in prediction.assumes
         and tolerance is not None
         and prediction.misalignment is None
         and scene.estimator.misalignment == "trust"

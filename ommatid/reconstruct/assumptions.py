@@ -16,6 +16,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.constants import MOST_DENSE
+from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
@@ -132,6 +133,28 @@ class Assumptions:
         return replace(
             result, interval=given.with_added(0.0, (count * unknown) ** 2, count) if given.variance else given
         )
+
+
+def assumptions_at(
+    stack: Stack, model: Model, choice: MethodChoice, image: FloatArray, execution: Execution
+) -> Assumptions:
+    """Collect the noise of a known image, (N,) or (pixels of the world,), and the method for a known prior.
+
+    Use it for predictions. A quick method is given readings of the prior's mean, of which there is nothing to solve.
+    """
+    usable, prior = usable_pixels(stack, model), stack.scene.assumed_prior
+    of_image = model_of_f(model, stack.camera, prior)
+    if image.size != of_image.unknowns:
+        image = averaged(image.reshape(stack.camera.world.shape), stack.camera.detail).ravel()
+    if usable.saturated:
+        stack, usable = censored(stack, of_image, usable, image, None)
+    observation = ObservedStack(stack, of_image, usable, prior)
+    noise = observation.noise(image)
+    if execution.quick:
+        recorded = of_image.forward(np.full(of_image.unknowns, prior.mean))
+        observation = replace(observation, stack=replace(stack, values=recorded))
+    method = METHODS[choice.method](observation.task(observation.expected_noise(noise)), execution)
+    return Assumptions(method, usable, prior, noise, None)
 
 
 def method_for(stack: Stack, model: Model) -> Method:

@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
 from scipy import linalg, sparse
 
-from ommatid.runtime.arrays import BoolArray, FloatArray
-from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.model import Model
-from ommatid.scenes.tables.estimation import EstimatorTable
+from ommatid.runtime.arrays import FloatArray
 
-from .estimator.estimate import factorise
-from .expected_error import ExpectedError, expected_error
+from .expected_error import ExpectedError
 from .measured_error import TRIM, trimmed_mean
-from .method_choice import METHODS, MethodChoice
-from .methods.level import variance_of
-from .methods.method import EstimationTask, Execution
-from .noise import at_used, uniform
-from .prior import Prior
-from .problem import Form, Problem, gram
+from .problem import gram
 
 PRIOR_ALONE = 0.9  # of the prior's variance: error from which measurements bring next to nothing
 NOISELESS = 1e-12  # of a measurement's prior variance: noise in place of none that an estimator expects where some is
@@ -114,115 +103,3 @@ def observability(matrix: sparse.csr_array) -> Observability:
     seen = values[values > RANK_TOLERANCE**2 * largest]
     condition = float(np.sqrt(largest / seen.min())) if seen.size else float("inf")
     return Observability(int(seen.size), matrix.shape[1] - int(seen.size), condition)
-
-
-def predict(
-    matrix: sparse.csr_array,
-    prior: Prior,
-    actual: float | FloatArray,
-    estimator: EstimatorTable,
-    shape: tuple[int, int],
-    misalignment_variance: Callable[[Form, BoolArray], FloatArray] | None = None,
-    prior_ratio: float = 1.0,
-    level: float = 0.0,
-) -> Prediction:
-    """Predict the error of one dense problem with noise of variance `actual`.
-
-    The estimator expects `estimator.noise_variance`, or the actual noise where that is not set. Without any noise the
-    error is the prior's part in the null space of H. Where an estimator expects none of the noise that there is, it is
-    the limit of Eq. 5 for ever less expected noise.
-
-    actual : one variance for all measurements, or (M,); NaN leaves a measurement out
-    prior : as the estimator assumes it;  prior_ratio : the actual variance of the pixels over that of `prior`
-    misalignment_variance : from a form and the measurements used, (M,), to what misalignment adds, (N,); asked where
-        the estimator expects noise
-    level : standard deviation of the image's common level, 0 where it is known or where there is no noise
-    Raises InputError where the noise is to be fitted to a stack, or where no form is right.
-    """
-    noise, expected_noise, used = _noises(actual, matrix.shape[0], estimator)
-    matrix = matrix if used.all() else sparse.csr_array(matrix[used])
-    seen, added = observability(matrix), None
-    if noise.any() and not (expected_noise > 0).all():
-        signal = float((abs(matrix) @ np.sqrt(prior.variance)).max(initial=0.0))
-        expected_noise = uniform(NOISELESS * signal**2, noise.size)
-    form, solver = factorise(Problem(matrix, prior, expected_noise), estimator.tolerance)
-    expected = expected_error(form, {"noise": noise / prior_ratio})
-    variance = prior_ratio * expected.variance
-    if level and form.problem.noisy:
-        variance = variance + _by_level(form, level)
-    if misalignment_variance is not None and form.problem.noisy:
-        added = misalignment_variance(form, used)
-        variance = variance + added
-    return Prediction.of(
-        variance,
-        expected,
-        seen,
-        shape,
-        measurements=noise.size,
-        method=solver.method,
-        misalignment=None if added is None else float(added.mean()),
-        prior_variance=prior_ratio * float(prior.variance.mean()),
-    )
-
-
-def _by_level(form: Form, level: float) -> FloatArray:
-    """Return what an unknown level adds to Eq. 5 for the expected noise: (N,)."""
-    prior, matrix = form.problem.prior, form.problem.matrix
-    constant = np.ones(matrix.shape[1])
-    wave = float(np.mean(prior.apply_root(prior.apply_root_transposed(constant))))
-    response = constant - form.gain(matrix @ constant)
-    return variance_of(response, wave, level**2) * np.square(response)
-
-
-def predict_frame(choice: MethodChoice, model: Model, camera: Camera, actual: float | FloatArray) -> Prediction:
-    """Predict the error by the method chosen; rank, null space and condition of H where one dense problem serves.
-
-    Use it for frames, and where the world is finer than f.
-
-    camera : on f's grid;  actual : one variance for all measurements, or (M,); NaN leaves a measurement out
-    Raises InputError where the noise is to be fitted to a stack, or where the estimator has no noise to expect.
-    """
-    scene = model.scene
-    noise, expected_noise, used = _noises(actual, model.measurements, scene.estimator)
-    if not (expected_noise > 0).all():
-        raise InputError(
-            f"{camera.unknowns} pixels are predicted with noise alone; set noise.variance or estimator.noise_variance"
-            " above 0"
-        )
-    recorded = model.forward(np.full(model.unknowns, scene.prior.mean))
-    task = EstimationTask(
-        model,
-        recorded,
-        used,
-        expected_noise,
-        scene.assumed_prior,
-        scene.estimator,
-        scene.tiles,
-        scene.prior_ratio,
-        finer=model.camera.rows // camera.rows,
-    )
-    result = METHODS[choice.method](task, Execution()).result({"noise": noise}, None)
-    seen = observability(model.matrix[used]) if choice.method == "dense" else None
-    return Prediction.of(
-        result.expected.variance,
-        result.expected,
-        seen,
-        camera.shape,
-        measurements=noise.size,
-        method=result.solver.method,
-        prior_variance=scene.prior.variance,
-        budget={"null_space": result.expected.missing, **result.expected.parts} if camera.has_detail else None,
-    )
-
-
-def _noises(
-    actual: float | FloatArray, measurements: int, estimator: EstimatorTable
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return actual and expected noise of the measurements used, and which of all are, (M,). Raises InputError."""
-    setting = estimator.noise_variance
-    if isinstance(setting, str):
-        raise InputError("estimator.noise_variance 'fit' takes a recorded stack; set a number to predict without one")
-    noise = actual if isinstance(actual, np.ndarray) else uniform(actual, measurements)
-    used = np.isfinite(noise)
-    noise = at_used(noise, used)
-    return noise, noise if setting is None else uniform(setting, noise.size), used

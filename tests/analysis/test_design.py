@@ -7,12 +7,9 @@ from fractions import Fraction
 import pytest
 
 from ommatid.analysis.design import magnifications, with_lens
-from ommatid.reconstruct.prediction import predict
-from ommatid.reconstruct.prior import independent
+from ommatid.analysis.predict import predict_scene
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
-from ommatid.scenes.tables.estimation import EstimatorTable
-from ommatid.simulate.ideal import ideal_matrix
 
 from ..conftest import Command
 from ..examples import GALLERY, scene
@@ -56,8 +53,10 @@ def test_the_ranking_follows_the_predictions(ommatid: Command) -> None:
     assert names == ["1/4", "1/5", "1/3", "1/6", "1/30"]
     assert design["candidates"][-1]["expected"] is None
     assert design["candidates"][-1]["reason"]
-    both = derive(scene(lenses=(("1/3", [3, 3], [5, 5]), ("1/4", [4, 4], [4, 4]))))
-    alone = predict(ideal_matrix(both), independent(127.5, 5461.25, 361), 1e-2, EstimatorTable(), (19, 19))
+    both = scene(
+        lenses=(("1/3", [3, 3], [5, 5]), ("1/4", [4, 4], [4, 4])), noise={"variance": 1e-2}, prior={"level": "known"}
+    )
+    alone = predict_scene(both, rays=False)
     assert design["candidates"][0]["expected"]["mse"] == pytest.approx(alone.mse, rel=1e-9)
     assert design["before"]["mse"] > design["candidates"][0]["expected"]["mse"]
     table = ommatid("design", GALLERY / "tile19.toml", *options)

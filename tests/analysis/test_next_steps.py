@@ -13,7 +13,7 @@ import pytest
 from ommatid.analysis.averaging_kernel import error_window
 from ommatid.analysis.design import with_lens
 from ommatid.analysis.next_steps import NextStep, best_other_type, next_steps
-from ommatid.analysis.predict import predict_ideal
+from ommatid.analysis.predict import predict_scene
 from ommatid.reconstruct.output.result_files import reconstruct
 from ommatid.reconstruct.output.run_json import MoreTime, RunReport, TimeReport, VerdictReport
 from ommatid.reconstruct.output.verdict_words import limit
@@ -105,9 +105,9 @@ def test_another_lens_type_brings_what_the_prediction_says() -> None:
     other = best_other_type(described, window)
     assert other is not None
     tried = [Fraction(1, 2), Fraction(1, 5)]  # those with the finest pixels that the camera does not have
-    after = {ratio: predict_ideal(with_lens(described, ratio)) for ratio in tried}
+    after = {ratio: predict_scene(with_lens(described, ratio), rays=False) for ratio in tried}
     assert other.magnification == min(tried, key=lambda ratio: after[ratio].mse)
-    chosen, before = after[other.magnification], predict_ideal(described)
+    chosen, before = after[other.magnification], predict_scene(described, rays=False)
     assert other.ratio == pytest.approx(chosen.mse / before.mse, rel=1e-6)
     assert other.measurements == chosen.measurements - before.measurements
     step = next(step for step in next_steps(report, other) if "lens type" in step.change)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ommatid.analysis.predict import predict_scene
+from ommatid.analysis.predict import needs_no_rays, predict_scene
 from ommatid.analysis.predicted_recording import predicted_recording
 from ommatid.analysis.prediction_table import json_of, rows
 from ommatid.reconstruct.expected_error import expected_error
@@ -180,7 +180,8 @@ def test_a_tolerance_as_designed_and_calibrated_side_by_side(ommatid: Command) -
 
 def test_without_a_fast_backend_it_is_the_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ommatid.simulate.calibration.pilot.choose", lambda _: "scalar_rgb")
-    predicted, closed = predict_scene(read(TILE)), predict_scene(read(TILE), rays=False)
+    scene = read(TILE, FEW)
+    predicted, closed = predict_scene(scene), predict_scene(scene, rays=False)
     assert predicted.mse == closed.mse
     assert "scalar backend" in predicted.assumes[0]
     assert rows(predicted)[0][0] == "assumes"
@@ -188,7 +189,21 @@ def test_without_a_fast_backend_it_is_the_closed_form(monkeypatch: pytest.Monkey
 
 def test_without_mitsuba_it_is_the_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "drjit", None)
-    assert "not installed" in predict_scene(read(TILE)).assumes[0]
+    assert "not installed" in predict_scene(read(TILE, FEW)).assumes[0]
+
+
+def test_adaptive_samples_of_a_camera_that_sees_the_same_everywhere_need_no_rays() -> None:
+    """Rays are traced where samples are fixed, H is drawn at random or has no closed form, and before worlds."""
+    assert "samples 'auto'" in predict_scene(read(TILE)).assumes[0]
+    auto = Setup.from_scene(read(TILE))
+    assert needs_no_rays(auto)
+    for change in (
+        'camera.tolerance.position="1 um"',
+        "calibration.samples=64",
+        "camera.lens.I.distortion=[0.05,0.02]",
+    ):
+        assert not needs_no_rays(Setup.from_scene(read(TILE, (change,)))), change
+    assert not needs_no_rays(Setup.from_scene(read(GALLERY / "corridor.toml")))
 
 
 def test_it_says_where_nothing_is_recovered(ommatid: Command) -> None:

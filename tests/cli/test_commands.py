@@ -75,6 +75,7 @@ def test_predict_gives_the_values_of_the_reference(
     keys = ["measurements", "unknowns", "rank", "null_space", "condition", "mse", "trimmed_mse", "trim"]
     assert list(predicted)[:8] == keys
     others = {"degrees_of_freedom", "resolution", "method", "prior_variance", "assumes", "recovers_nothing"}
+    others |= {"budget", "interval", "mse_for_picture"}
     assert others == set(predicted) - set(keys)
     assert {key: predicted[key] for key in expected} == pytest.approx(expected, rel=1e-5)
     assert predicted["rank"] + predicted["null_space"] == predicted["unknowns"]

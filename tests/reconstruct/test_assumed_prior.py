@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ommatid.analysis.predict import predict_ideal
+from ommatid.analysis.predict import predict_scene
 from ommatid.analysis.run_prediction import predict_run
 from ommatid.reconstruct.estimator.estimate import factorise
-from ommatid.reconstruct.misalignment.moments import misalignment_variance
+from ommatid.reconstruct.misalignment.moments import misaligned_moments, mismatch_variance
 from ommatid.reconstruct.prior import independent, prior_of
 from ommatid.reconstruct.problem import Problem
 from ommatid.reconstruct.restore import Reconstruction, restore
@@ -71,8 +71,8 @@ def reconstructed(scene: Scene, seed: int) -> Reconstruction:
 def test_the_prediction_and_the_error_map_are_those_of_equation_5(assumed: float, prior: dict[str, Any]) -> None:
     scene = described(assumed, prior=prior)
     variance = np.diag(dense(scene)[2])
-    assert predict_ideal(scene).mse == pytest.approx(variance.mean(), rel=1e-8)
-    assert predict_ideal(scene).prior_variance == pytest.approx(ACTUAL)
+    assert predict_scene(scene, rays=False).mse == pytest.approx(variance.mean(), rel=1e-8)
+    assert predict_scene(scene, rays=False).prior_variance == pytest.approx(ACTUAL)
     done = reconstructed(scene, 0)
     np.testing.assert_allclose(done.expected.variance, variance, rtol=1e-7)
     assert sum(done.budget().values()) == pytest.approx(variance.mean(), rel=1e-7)
@@ -130,7 +130,8 @@ def test_the_cost_of_misalignment_is_that_of_images_with_the_actual_variance() -
     assumed, actual = (independent(127.5, variance, 144) for variance in (50.0, ACTUAL))
     matrix = ideal_matrix(camera)
     form, _ = factorise(Problem(matrix, assumed, np.full(camera.measurements, NOISE)))
-    added = float(misalignment_variance(form, np.ones(camera.measurements, dtype=np.bool_), camera, actual).mean())
+    used, moments = np.ones(camera.measurements, dtype=np.bool_), misaligned_moments(camera, actual)
+    added = float(mismatch_variance(form, used, moments, camera.slices(), actual).mean())
     rng, differences = np.random.default_rng(0), []
     for seed in range(300):
         image = actual.mean + actual.apply_root(rng.standard_normal(144))

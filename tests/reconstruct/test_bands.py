@@ -33,14 +33,20 @@ def reflected(size: int, length: int, odd: bool, detail: int = DETAIL) -> tuple[
     return [np.where(each < end, each, 2 * end - 1 - each) for each in seen], roots
 
 
-def continued(kernel: Array, odd: bool, detail: int = DETAIL) -> Array:
-    """Readings beyond the edges included, as a matrix."""
+def continued(kernel: Array, odd: bool, detail: int = DETAIL, edges: tuple[int, int, int] | None = None) -> Array:
+    """Readings beyond the edges included, as a matrix; edges : an axis, the first reading along it, and their count."""
     axes = [reflected(size, length, odd, detail) for size, length in zip(SHAPE, kernel.shape, strict=True)]
+    if edges is not None:
+        axis, first, count = edges
+        axes[axis] = [first + detail * n + np.arange(kernel.shape[axis]) for n in range(count)], np.ones(count)
     rows: list[Array] = []
     for down, root in zip(*axes[0], strict=True):
         for across, factor in zip(*axes[1], strict=True):
             row = np.zeros((SHAPE[0] * detail, SHAPE[1] * detail))
-            np.add.at(row, (down[:, None], across[None, :]), root * factor * kernel)
+            inside = np.ix_((down >= 0) & (down < len(row)), (across >= 0) & (across < row.shape[1]))
+            np.add.at(
+                row, (down[inside[0].ravel()][:, None], across[inside[1].ravel()]), root * factor * kernel[inside]
+            )
             rows.append(row.ravel())
     return np.array(rows)
 
@@ -106,6 +112,26 @@ def test_variances_far_from_the_edges_are_those_of_the_averages(camera: tuple[Ba
     posterior = float(np.trace(average @ covariance @ average.T)) / pixels
     expected = posterior, posterior - sum(parts), parts[0] + 3 * parts[1]
     np.testing.assert_allclose(bands.variances(1.0, ratios), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_variances_between_two_edges(camera: tuple[Bands, Array, list[Array]], axis: int) -> None:
+    """Along the lines readings continue, across them they end: by a matrix of these readings."""
+    bands = camera[0]
+    down, across = (repetition(size, DETAIL).T / DETAIL for size in SHAPE)
+    pixels = sparse.kron(down, across).toarray()
+    waves = np.kron(*(fft.dct(np.eye(size), 2, axis=0, norm="ortho") for size in bands.spectrum.shape))
+    prior = waves.T @ np.diag(1 / bands.spectrum.ravel()) @ waves
+    level, ratios, parts = 1.7, (1.0, 3.0), list[Array]()
+    for readings, weight, odd in zip(bands.types, bands.weights, (True, False), strict=True):
+        matrix = continued(readings.kernels[0], odd, edges=(axis, readings.first[axis], readings.count[axis]))
+        parts.append(level * weight * matrix.T @ matrix)
+    columns = pixels @ np.linalg.inv(prior + parts[0] + parts[1])
+    matrices = np.linalg.inv(prior + parts[0] + parts[1]), prior, ratios[0] * parts[0] + ratios[1] * parts[1]
+    expected = [np.diagonal(pixels @ matrices[0] @ pixels.T)]
+    expected += [np.einsum("pn,nm,pm->p", columns, each, columns) for each in matrices[1:]]
+    lines = [each.reshape(SHAPE).mean(axis=1 - axis) for each in expected]
+    np.testing.assert_allclose(bands.variances_across(axis, level, ratios), lines, rtol=1e-9)
 
 
 def test_strips_mend_the_edges() -> None:

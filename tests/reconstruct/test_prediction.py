@@ -5,17 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ommatid.analysis.predict import predict_scene
 from ommatid.reconstruct.measured_error import measure_error, trimmed_mean
-from ommatid.reconstruct.prediction import predict
-from ommatid.reconstruct.prior import independent
+from ommatid.reconstruct.prediction import Prediction
+from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
+from ommatid.scenes.recording import expected_recording
 from ommatid.scenes.scene import read
-from ommatid.scenes.tables.estimation import EstimatorTable, PriorTable
+from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.estimation import PriorTable
 from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.sensors import response
 
 from ..examples import GALLERY
 
 PRIOR = PriorTable()
+
+
+def predicted(name: str, lenses: tuple[str, ...], *changes: str) -> Prediction:
+    return predict_scene(read(GALLERY / f"{name}.toml", changes, lenses), rays=False)
 
 
 @pytest.mark.parametrize(
@@ -33,14 +41,9 @@ def test_reference_values_of_extended_precision(
     name: str, lenses: tuple[str, ...], reference: float, rank: int
 ) -> None:
     """Computed with 300 bits; expected and actual noise variance 1e-6."""
-    camera = derive(read(GALLERY / f"{name}.toml", (), lenses))
-    matrix = ideal_matrix(camera)
-    shape = camera.shape
-    prediction = predict(
-        matrix, independent(PRIOR.mean, PRIOR.variance, camera.unknowns), 1e-6, EstimatorTable(), shape
-    )
+    prediction = predicted(name, lenses, "noise.variance=1e-6")
     assert prediction.mse == pytest.approx(reference, rel=1e-5)
-    assert (prediction.rank, prediction.null_space) == (rank, camera.unknowns - rank)
+    assert (prediction.rank, prediction.null_space) == (rank, prediction.unknowns - rank)
 
 
 @pytest.mark.parametrize(
@@ -58,9 +61,7 @@ def test_reference_values_where_the_expectation_is_wrong(
     name: str, lenses: tuple[str, ...], actual: float, expected: float, reference: float, digits: float
 ) -> None:
     """To all the digits that they were given with."""
-    camera = derive(read(GALLERY / f"{name}.toml", (), lenses))
-    prior = independent(PRIOR.mean, PRIOR.variance, camera.unknowns)
-    prediction = predict(ideal_matrix(camera), prior, actual, EstimatorTable(noise_variance=expected), camera.shape)
+    prediction = predicted(name, lenses, f"noise.variance={actual}", f"estimator.noise_variance={expected}")
     assert prediction.mse == pytest.approx(reference, rel=digits)
     if reference == 2.79766:
         assert prediction.trimmed_mse == pytest.approx(1.85623, rel=5e-6)
@@ -76,11 +77,33 @@ def test_prediction_by_eigenvalues(lenses: tuple[str, ...], noise: float) -> Non
     values = np.linalg.svd(matrix.toarray(), compute_uv=False)
     singular[: values.size] = values
     by_values = np.mean(noise * PRIOR.variance / (noise + singular**2 * PRIOR.variance))
-    prediction = predict(matrix, independent(PRIOR.mean, PRIOR.variance, 361), noise, EstimatorTable(), (19, 19))
+    prediction = predicted("tile19", lenses, f"noise.variance={noise}")
     assert prediction.mse == pytest.approx(by_values, rel=1e-6)
     assert prediction.rank == np.linalg.matrix_rank(matrix.toarray(), tol=1e-9)
     seen = values[: prediction.rank]
     assert prediction.condition == pytest.approx(seen[0] / seen[-1], rel=1e-6)
+
+
+def test_the_noise_of_a_sensor_is_that_of_its_picture() -> None:
+    """Against the dense solution for the shot noise, read noise and rounding of the light that the picture sends."""
+    sensor = ("noise=", 'sensor.illuminance="500 lux"', 'sensor.exposure="0.5 ms"', "camera.wavelength=none")
+    apertures = tuple(f'camera.lens.{name}.aperture="0.1 mm"' for name in ("I", "II", "III"))
+    scene = read(GALLERY / "tile19.toml", (*apertures, *sensor))
+    setup = Setup.from_scene(scene)
+    dense, electrons = ideal_matrix(setup.camera).toarray(), response(setup)
+    assert scene.sensor is not None
+    light = dense @ setup.image.ravel()
+    noise = expected_recording(scene.sensor, setup.camera, electrons, light).noise_variance(light)
+    exact = np.linalg.inv(dense.T @ (dense / noise[:, None]) + np.eye(361) / PRIOR.variance)
+    prediction = predict_scene(scene, rays=False)
+    assert prediction.mse == pytest.approx(float(np.trace(exact)) / 361, rel=0.02)
+    assert prediction.budget is not None
+    assert sum(prediction.budget.values()) == pytest.approx(prediction.mse, rel=1e-9)
+
+
+def test_an_estimator_that_expects_no_noise_is_refused_as_its_run_is() -> None:
+    with pytest.raises(InputError, match="measurements without noise contradict one another"):
+        predicted("tile19", (), "noise.variance=2", "estimator.noise_variance=0")
 
 
 def test_measures_of_error() -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from skimage import data
 
-from ommatid.analysis.predict import predict_ideal
+from ommatid.analysis.predict import predict_scene
 from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
@@ -308,7 +308,7 @@ def test_a_prediction_fits_the_prior_to_the_picture(picture: bool, said: str) ->
     if not picture:
         target = described.target.model_copy(update={"image": None, "origin": None})
         described = described.model_copy(update={"target": target})
-    prediction = predict_ideal(described)
+    prediction = predict_scene(described, rays=False)
     assert said in " ".join(prediction.assumes)
     if picture:
         truth = Setup.from_scene(described).image.ravel()

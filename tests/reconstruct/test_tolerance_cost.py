@@ -7,7 +7,12 @@ import pytest
 from scipy import stats
 
 from ommatid.reconstruct.estimator.estimate import factorise
-from ommatid.reconstruct.misalignment.moments import misaligned_matrix, misalignment_variance, tolerances
+from ommatid.reconstruct.misalignment.moments import (
+    misaligned_matrix,
+    misaligned_moments,
+    mismatch_variance,
+    tolerances,
+)
 from ommatid.reconstruct.prior import independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
@@ -22,7 +27,8 @@ from ..runs import document
 def cost_of(camera: Camera, variance: float = 1e-2) -> float:
     prior, used = independent(127.5, 5461.25, camera.unknowns), np.ones(camera.measurements, dtype=np.bool_)
     form, _ = factorise(Problem(ideal_matrix(camera), prior, np.full(camera.measurements, variance)))
-    return float(misalignment_variance(form, used, camera, prior).mean())
+    moments = misaligned_moments(camera, prior)
+    return float(mismatch_variance(form, used, moments, camera.slices(), prior).mean())
 
 
 def mean_over(camera: Camera, tables: FloatArray, variance: float = 1e-2) -> tuple[float, float]:

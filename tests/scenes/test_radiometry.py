@@ -11,8 +11,6 @@ import pytest
 from scipy import integrate
 
 from ommatid.analysis.summary import light_rows
-from ommatid.reconstruct.prediction import predict
-from ommatid.reconstruct.prior import independent
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.optics import radiometry
@@ -20,9 +18,7 @@ from ommatid.scenes.optics.radiometry import electrons, predicted_noise, solid_a
 from ommatid.scenes.pose import NO_MISALIGNMENT, Misalignment, pose_of
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.camera import ToleranceTable
-from ommatid.scenes.tables.estimation import EstimatorTable
 from ommatid.scenes.tables.sensor import SensorTable
-from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import THREE, Lenses, scene
 
@@ -143,33 +139,6 @@ def test_the_summary_has_the_light_of_each_type() -> None:
     assert {"without light", "warning"} <= {line[0] for line in light_rows(result)}
     dark = summary(described, camera, np.zeros_like(response))
     assert "too little light" in light_rows(dark)[1][1]
-
-
-@pytest.mark.slow
-def test_a_prediction_with_unequal_noise() -> None:
-    """Against the dense solution, with and without knowledge of the noise, and with dead pixels."""
-    camera = derive(scene(lenses=THREE))
-    matrix, prior = ideal_matrix(camera), independent(127.5, 5461.25, 361)
-    noise = np.random.default_rng(0).uniform(0.5, 4.0, camera.measurements)
-    dense = matrix.toarray()
-    exact = np.linalg.inv(dense.T @ (dense / noise[:, None]) + np.eye(361) / 5461.25)
-    result = predict(matrix, prior, noise, EstimatorTable(), (19, 19))
-    assert result.mse == pytest.approx(float(np.trace(exact)) / 361, rel=1e-9)
-    same = [
-        predict(matrix, prior, described, EstimatorTable(), (19, 19)).mse
-        for described in (2.0, np.full(noise.size, 2.0))
-    ]
-    assert same[0] == same[1]
-    overconfident = predict(matrix, prior, noise, EstimatorTable(noise_variance=0.0), (19, 19))
-    gain = np.linalg.pinv(dense)
-    limit = np.square(gain) @ noise + 5461.25 * np.diag(np.eye(361) - gain @ dense)
-    assert overconfident.mse == pytest.approx(float(limit.mean()), rel=1e-6)
-    noise[::7] = np.nan
-    some = predict(matrix, prior, noise, EstimatorTable(), (19, 19))
-    assert some.measurements == int(np.isfinite(noise).sum())
-    kept = dense[np.isfinite(noise)]
-    exact = np.linalg.inv(kept.T @ (kept / noise[np.isfinite(noise)][:, None]) + np.eye(361) / 5461.25)
-    assert some.mse == pytest.approx(float(np.trace(exact)) / 361, rel=1e-9)
 
 
 def test_saturated_pixels_are_ignored_in_a_prediction() -> None:

@@ -120,8 +120,12 @@ class Bands:
     @cached_property
     def _pixels(self) -> FloatArray:
         """a, of the averages over pixels of f: (F rows, F columns)."""
-        average = np.full((1, self.detail, self.detail), self.detail**-2.0)
-        return next(self._rows_of(Readings(average, (0, 0), self.shape)))
+        return next(self._rows_of(self._averages))
+
+    @property
+    def _averages(self) -> Readings:
+        """f's pixels, which are averages of the world's."""
+        return Readings(np.full((1, self.detail, self.detail), self.detail**-2.0), (0, 0), self.shape)
 
     def _rows_of(self, readings: Readings) -> Iterator[FloatArray]:
         """Yield the transfer function of each kernel of readings with the signs and the norms of the aliases."""
@@ -201,26 +205,73 @@ class Bands:
         size, detail = self.shape[axis], self.detail
         depth = min(DEPTH, size // 2) * detail
         part = slice(size * detail - depth, size * detail) if last else slice(0, depth)
+        members, prior = self._prior_on(axis, part)
+        seen, whole = (
+            sum((weight * each for weight, each in zip(self.weights, parts, strict=True)), prior)
+            for parts in (self._information_on(axis, part, members, complete=complete) for complete in (False, True))
+        )
+        return _Edge(axis, part, members, seen, whole)
+
+    def _prior_on(self, axis: int, part: slice) -> tuple[IntArray, FloatArray]:
+        """Return the groups of waves along lines of the world, and P^-1 on them: (groups, lines, F, lines, F)."""
+        depth, detail = part.stop - part.start, self.detail
         members = _members(self.shape[1 - axis], detail)
-        pairs = _pairs(size * detail, part)
+        pairs = _pairs(self.shape[axis] * detail, part)
         precision = 1 / (self.spectrum if axis == 0 else self.spectrum.T)
         priors = (precision.T @ pairs).reshape(-1, depth, depth)[members]
         priors[members < 0] = np.eye(depth)
-        seen, whole = (np.zeros((len(members), depth, detail, depth, detail)) for _ in range(2))
+        total = np.zeros((len(members), depth, detail, depth, detail))
         for number in range(detail):
-            for total in (seen, whole):
-                total[:, :, number, :, number] = priors[:, number]
-        for readings, weight in zip(self.types, self.weights, strict=True):
-            for total, complete in ((seen, False), (whole, True)):
-                shares = _shares(readings, axis, size, detail, part, complete=complete)
-                for kernel in readings.kernels:
-                    lines = kernel if axis == 0 else kernel.T
-                    along = (self._along(readings, 1 - axis, _is_turned(kernel, 1 - axis)) @ lines.T)[members]
-                    along[members < 0] = 0.0
-                    values = np.einsum("pxa,kla->kpxl", shares, along, optimize=True)
-                    values = values.reshape(len(members), len(shares), -1)
-                    total += (weight * values.swapaxes(1, 2) @ values).reshape(total.shape)
-        return _Edge(axis, part, members, seen, whole)
+            total[:, :, number, :, number] = priors[:, number]
+        return members, total
+
+    def _information_on(self, axis: int, part: slice, members: IntArray, *, complete: bool) -> Iterator[FloatArray]:
+        """Yield H^T H of each lens type on lines of the world, as `_prior_on` has P^-1.
+
+        complete : True for readings that continue beyond the edges, where they see the world reflected
+        """
+        size, detail, depth = self.shape[axis], self.detail, part.stop - part.start
+        for readings in self.types:
+            shares = _shares(readings, axis, size, detail, part, complete=complete)
+            total = np.zeros((len(members), depth, detail, depth, detail))
+            for kernel in readings.kernels:
+                lines = kernel if axis == 0 else kernel.T
+                along = (self._along(readings, 1 - axis, _is_turned(kernel, 1 - axis)) @ lines.T)[members]
+                along[members < 0] = 0.0
+                values = np.einsum("pxa,kla->kpxl", shares, along, optimize=True)
+                values = values.reshape(len(members), len(shares), -1)
+                total += (values.swapaxes(1, 2) @ values).reshape(total.shape)
+            yield total
+
+    def variances_across(self, axis: int, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return what `variances` does for each line of f between two edges: (3, size).
+
+        Readings continue beyond the other two edges, so that waves along the lines separate.
+        """
+        size, detail = self.shape[axis], self.detail
+        part = slice(0, size * detail)
+        members, prior = self._prior_on(axis, part)
+        weighted = [
+            level * weight * each
+            for weight, each in zip(
+                self.weights, self._information_on(axis, part, members, complete=False), strict=True
+            )
+        ]
+        square = (len(members), size * detail**2, size * detail**2)
+        covariance = np.linalg.inv(sum(weighted, prior).reshape(square))
+        waves = (self._along(self._averages, 1 - axis, False) @ self._averages.kernels[0, 0])[members]
+        waves[members < 0] = 0.0
+        lines = np.repeat(np.eye(size), detail, axis=1)
+        pixels = np.einsum("dx,kl->kdxl", lines, waves).reshape(len(members), size, -1)
+        columns = pixels @ covariance
+
+        def mean(matrix: FloatArray) -> FloatArray:
+            squares = np.einsum("kdn,kdn->kd", columns @ matrix.reshape(square), columns)
+            return np.asarray(squares.sum(axis=0) / self.shape[1 - axis])
+
+        posterior = np.einsum("kdn,kdn->d", columns, pixels) / self.shape[1 - axis]
+        noisy = sum((ratio * mean(each) for ratio, each in zip(ratios, weighted, strict=True)), np.zeros(size))
+        return np.array([posterior, mean(prior), noisy])
 
     @cached_property
     def _corners(self) -> list[tuple[slice, slice, FloatArray]]:
@@ -261,15 +312,34 @@ class Bands:
 
         level : by which all weights are multiplied;  ratios : of the actual to the expected noise of each lens type
         """
-        values, vectors, seen, before = self._of_pixels
-        along = seen / (1 + level * values)
-        posterior = before - level * np.einsum("iju,iju->ij", along, seen)
-        gain = np.einsum("ijtu,iju->ijt", vectors, along) * level
+        _, _, seen, before = self._of_pixels
+        posterior = before - np.einsum("iju,iju->ij", self._along_vectors(level), seen)
+        expected = self.noise_of_waves(level, (1.0,) * len(ratios))
+        noisy = self.noise_of_waves(level, ratios).mean()
+        return float(posterior.mean()), float((posterior - expected).mean()), float(noisy)
+
+    def noise_of_waves(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return the variance of each wave of f's pixels by noise, as of `variances`: (rows, columns)."""
+        gain = np.einsum("ijtu,iju->ijt", self._of_pixels[1], self._along_vectors(level))
         # The noise of a type, 1 / w, passes through its gain; both are finite for a weight of 0.
         weights = level * self._of_rows(self.weights)
         noise = np.divide(np.square(gain), weights, out=np.zeros_like(gain), where=weights > 0)
-        total, missing = posterior.mean(), (posterior - noise.sum(axis=-1)).mean()
-        return float(total), float(missing), float((noise @ self._of_rows(ratios)).mean())
+        return np.asarray(noise @ self._of_rows(ratios))
+
+    def detail_variance(self) -> float:
+        """Return the error of a pixel of f by what f does not hold of a random world of the prior.
+
+        Such a world has the prior variance of its readings less what these share with f's pixels.
+        """
+        values, _, seen, before = self._of_pixels
+        along = self._along_vectors(1.0)
+        shared = np.square(np.einsum("iju,iju->ij", along, seen)) / before
+        return float((np.einsum("iju,iju->ij", np.square(along), values) - shared).mean())
+
+    def _along_vectors(self, level: float) -> FloatArray:
+        """Return the gain of f's waves along the vectors of `_spectral`: (rows, columns, types)."""
+        values, _, seen, _ = self._of_pixels
+        return level * seen / (1 + level * values)
 
     @cached_property
     def _of_pixels(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

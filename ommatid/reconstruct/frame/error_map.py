@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
-from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.observation import Entries
 
 from ..methods.method import EstimationTask
@@ -28,7 +27,7 @@ from .conjugate_gradients import BandedSystem, FrameSystem, NotReachedError, lea
 from .reading_space import ReadingSpace
 from .swept import swept_maps
 from .variance_map import VarianceMap, frame_map, is_narrow, is_uneven, unseen_corners, ways_to_edges
-from .windows import HALOS, VARYING, Windows, by_windows, windows_map
+from .windows import HALOS, Windows, by_windows, varies_over_field, windows_map
 
 Pixels = NDArray[np.intp]
 
@@ -45,6 +44,7 @@ NO_VARIANCE = 1.0  # error of a map with pixels whose variance is not a positive
 EXACT = 1e-3  # relative accuracy of a solution
 MOST_EXACT = 45  # pixels of f along an axis of a frame whose map is exact
 MOST_READINGS = 3600  # of such a frame where the world is finer
+UNCHECKED = 2e-2  # error of the fastest map
 ROUGH = 2e-2  # error of a variance at random pixels above which another map is tried
 
 
@@ -146,7 +146,7 @@ def error_map(task: EstimationTask, system: FrameSystem, actual: FloatArray, *, 
         whole = Windows(task, actual, task.shape_of_f).map(task.model.applied, (0, 0))
         return ErrorMap(VarianceMap(*whole), MapCheck(0.0, 0.0), prior)
     if quick:
-        return ErrorMap(_fastest_map(task, system, actual), MapCheck(0.0, 0.0), prior)
+        return ErrorMap(_fastest_map(task, system, actual), MapCheck(UNCHECKED, UNCHECKED), prior)
     noise = None
     if not np.allclose(actual, task.expected_noise, rtol=1e-12):
         noise = system.weights**2 * task.on_all_measurements(actual, 0.0)
@@ -169,7 +169,7 @@ def _is_small(task: EstimationTask, readings: int) -> bool:
 def _fastest_map(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> VarianceMap:
     if system.bands is None:
         return next(_maps(task, system, actual))
-    return frame_map(task, system, system.bands, actual, far=ways_to_edges(task, system.bands)[0])
+    return frame_map(task, system, system.bands, actual, swept=ways_to_edges(task, system.bands)[0], quick=True)
 
 
 def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iterator[VarianceMap]:
@@ -184,10 +184,9 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
     few, narrow = task.model.unknowns <= MANY, is_narrow(task)
     uneven = is_uneven(task, system)
     if is_invariant(task) and not (narrow and uneven):
-        parts = task.model.applied.parts
-        varies = any(isinstance(part, KernelFootprints) and part.variation > VARYING for part in parts)
-        for far in ways_to_edges(task, system.bands):
-            maps = frame_map(task, system, system.bands, actual, far=far)
+        varies = varies_over_field(task.model.applied)
+        for swept in ways_to_edges(task, system.bands):
+            maps = frame_map(task, system, system.bands, actual, swept=swept)
             maps = by_windows(maps, task, task.model.applied, actual) if varies else maps
             yield _with_corners(maps, task, system, actual) if narrow else maps
         if not few or task.finer > 1 or not (varies or uneven):

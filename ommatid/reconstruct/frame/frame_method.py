@@ -12,6 +12,7 @@ from itertools import chain, islice
 from math import isfinite
 
 import numpy as np
+from scipy import fft
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -34,6 +35,7 @@ from ..methods.method import (
 from ..output.run_json import SolverReport
 from ..prior import coloured
 from ..verdict.residual import ResidualInputs, ResidualPower
+from .bands import Bands
 from .conjugate_gradients import (
     BandedSystem,
     FrameSystem,
@@ -45,6 +47,7 @@ from .conjugate_gradients import (
 )
 from .error_map import MANY, ErrorMap, error_map, is_invariant
 from .reading_space import ReadingSpace, moments_of
+from .variance_map import VarianceMap, mean_ratios
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 INVARIANT = "every lens type is shift-invariant except at the edges"
@@ -61,12 +64,13 @@ DRAWN, MOST_DRAWS = 20_000, 16  # pixels of random images together, so that a me
 class FrameError:
     """The expected error of every frame of the same noise.
 
-    maps : of its variances;  power : expected squares of the residual, `bias` that of an image equal to f0
+    maps : of its variances
+    power : expected squares of the residual, `bias` that of an image equal to f0; None where the error alone is asked
     """
 
     expected: ExpectedError
     maps: ErrorMap
-    power: ResidualPower
+    power: ResidualPower | None
 
 
 class FrameMethod(Method):
@@ -121,7 +125,10 @@ class FrameMethod(Method):
 
     def left_of_constant(self, value: float) -> FloatArray:
         """Return C P0^-1 1, (unknowns,), to the accuracy of the estimate for an image of this value."""
-        right = self.system.apply_prior_precision(np.full(self.task.model.unknowns, value))
+        constant = np.full(self.task.model.unknowns, value)
+        right = self.system.apply_prior_precision(constant)
+        if self._quick_bands is not None:
+            return self._quick_bands.solve(right.reshape(self.task.shape)).ravel() / value
         return self.system.solve(right, self.task.settings.accuracy).image / value
 
     def operators(self) -> PosteriorOperators:
@@ -137,7 +144,8 @@ class FrameMethod(Method):
         self.execution.progress(0.9)
         expected, check = errors.expected, errors.maps.check
         deviation = None if truth is None else self._of_unknowns(truth) - task.prior.mean
-        given = None if deviation is None else self._interval(deviation, actual, expected, check.mean)
+        variances = errors.maps.variances
+        given = None if deviation is None else self._interval(deviation, actual, expected, check.mean, variances)
         solver = SolverReport(
             way="frame",
             method="frame",
@@ -171,7 +179,8 @@ class FrameMethod(Method):
             parts[DETAIL] = min(self._by_detail(), missing)
         self.execution.progress(0.8)
         expected = ExpectedError(variances.variance, missing - parts.get(DETAIL, 0.0), parts, resolved)
-        return FrameError(expected, maps, self._random_power(actual, expected.degrees_of_freedom))
+        power = None if self.execution.quick else self._random_power(actual, expected.degrees_of_freedom)
+        return FrameError(expected, maps, power)
 
     def _of_unknowns(self, truth: FloatArray) -> FloatArray:
         """Return a true image on the grid of the unknowns; one of f becomes a random world with its averages."""
@@ -185,7 +194,9 @@ class FrameMethod(Method):
 
     def _by_detail(self) -> float:
         """Return the mean squared error by what f does not hold of a random world of the prior."""
-        task = self.task
+        task, bands = self.task, self._quick_bands
+        if bands is not None:
+            return bands.detail_variance()
         rng, spectrum = probe(Purpose.DETAIL), 1 / np.asarray(task.precision_on(task.shape))
         squares = 0.0
         for _ in range(self._draws):
@@ -193,6 +204,11 @@ class FrameMethod(Method):
             world -= world_of(task.of_f(world).reshape(task.shape_of_f), spectrum, task.finer)
             squares += self._mean_square(task.observe(world))
         return squares / self._draws
+
+    @property
+    def _quick_bands(self) -> Bands | None:
+        """The camera's transfer functions where they are enough, None where random images are to be solved for."""
+        return self.system.bands if self.execution.quick else None
 
     @property
     def _draws(self) -> int:
@@ -223,8 +239,10 @@ class FrameMethod(Method):
         power = inputs.power(chain(residuals, map(self._residual_of, columns)), task.expected_noise)
         return replace(power, bias=None)
 
-    def _residual_power(self, power: ResidualPower, deviation: FloatArray | None) -> ResidualPower:
+    def _residual_power(self, power: ResidualPower | None, deviation: FloatArray | None) -> ResidualPower | None:
         """Return the expected squares of the residual for the true image f0 + `deviation`, (N,), if it is known."""
+        if power is None:
+            return None
         if deviation is None:
             return replace(power, bias=None, noise=None)
         bias = self._residual_of(deviation)
@@ -269,12 +287,14 @@ class FrameMethod(Method):
 
     def _parts(self, noise: dict[str, FloatArray], mean: float) -> dict[str, float]:
         """Share of each cause of noise in the mean of Eq. 5; they add up to `mean`."""
-        rng = probe(Purpose.ERROR_PARTS)
+        rng, bands = probe(Purpose.ERROR_PARTS), self._quick_bands
         parts: dict[str, float] = {}
         uniform: tuple[float, float] | None = None  # a uniform variance and its part
         for name, values in noise.items():
             if len(noise) == 1 or not values.any():
                 parts[name] = float(values.any())
+            elif bands is not None:
+                parts[name] = bands.variances(1.0, mean_ratios(self.task, self.system.weights, values))[2]
             elif is_uniform(values) and uniform is not None:
                 parts[name] = uniform[1] * float(values[0]) / uniform[0]
             else:
@@ -285,10 +305,19 @@ class FrameMethod(Method):
         return {name: part * share for name, part in parts.items()}
 
     def _interval(
-        self, deviation: FloatArray, actual: FloatArray, expected: ExpectedError, map_error: float
+        self,
+        deviation: FloatArray,
+        actual: FloatArray,
+        expected: ExpectedError,
+        map_error: float,
+        variances: VarianceMap,
     ) -> Interval:
         """Interval of the mean squared error of the true image; that less its prior's mean is `deviation`."""
         task, system, count = self.task, self.system, expected.variance.size
+        noisy = count * sum(part for name, part in expected.parts.items() if name != DETAIL)  # the world is known
+        if self._quick_bands is not None:
+            lost, variance = self._by_waves(self._quick_bands, deviation, actual, variances)
+            return interval(lost + noisy, variance + (map_error * noisy) ** 2, count)
         bias = task.of_f(self._solve(system.apply_prior_precision(deviation)))
         along = float(actual @ np.square(self._transposed_gain(task.of_unknowns(bias))))
         rng, squares = probe(Purpose.ERROR_INTERVAL), 0.0
@@ -296,9 +325,24 @@ class FrameMethod(Method):
             gain = self._transposed_gain(task.of_unknowns(rng.normal(size=count)))
             right = system.right_hand_side(task.on_all_measurements(actual * gain, 0.0))
             squares += float(np.square(task.of_f(self._solve_weights(right))).sum()) / self._draws
-        noisy = count * sum(part for name, part in expected.parts.items() if name != DETAIL)  # the world is known
         variance = 4 * along + 2 * squares + (map_error * noisy) ** 2
         return interval(float(bias @ bias) + noisy, variance, count)
+
+    def _by_waves(
+        self, bands: Bands, deviation: FloatArray, actual: FloatArray, variances: VarianceMap
+    ) -> tuple[float, float]:
+        """Return the square of the bias of a deviation, and the variance of the squared error, from waves.
+
+        The covariance of errors by noise is taken to be that far from the edges, times the root of the map at both
+        pixels.
+        """
+        noise = bands.noise_of_waves(1.0, mean_ratios(self.task, self.system.weights, actual))
+        right = self.system.apply_prior_precision(deviation)
+        bias = self.task.of_f(bands.solve(right.reshape(self.task.shape)).ravel()).reshape(bands.shape)
+        local = variances.noisy.reshape(bands.shape) / noise.mean()
+        waves: FloatArray = np.asarray(fft.dctn(bias * np.sqrt(local), 2, norm="ortho"), dtype=np.float64)
+        along, squares = (noise * np.square(waves)).sum(), np.square(noise).sum() * np.square(local).mean()
+        return float(np.square(bias).sum()), float(4 * along + 2 * squares)
 
 
 def _with_mean_kernels(system: FrameSystem) -> FrameSystem:

@@ -1,8 +1,8 @@
 """The expected error (Eq. 5) of every pixel of a frame whose lens types see the same everywhere.
 
-Far from the edges it is that of the transfer functions for the noise of the measurements near a pixel. A small frame
-with the same edges shows how much larger it is near them. Of few pixels the covariances are matrices, and the map is
-exact.
+Far from the edges it is that of the transfer functions for the noise of the measurements near a pixel. Strips with the
+same edges, and a small frame at the corners, show how much larger it is near them. Of few pixels the covariances are
+matrices, and the map is exact.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ from .bands import Bands
 from .conjugate_gradients import FrameSystem, leaves_null_space
 from .swept import swept_maps
 
-SIDE, FINE_SIDE = 40, 30  # pixels of f of a small frame, and where the world is finer
-LONG, SHORT = 60, 44  # of those from which the effect of the length follows
-GRID = 256  # pixels of f along an axis of the frame without edges
+SIDE, FINE_SIDE, QUICK_SIDE = 40, 18, 24  # pixels of f of a small frame, where the world is finer, and for a mean
+LINES, LEAST_LINES = 120, 24  # of f between the edges of a strip: for a world as fine as f, and for any
+ALONG = 64  # pixels of f along it, which has no edges there
+GRID = 64  # pixels of f along an axis of a frame of reflecting edges
 DEEP = 9  # of a strip along an edge, in kernels; half of it is used
-LEAST_SHARE = 0.1  # of a variance in the small frame, which that in a large one is at least
+LEAST = 1e-10  # of the posterior variance, that its parts are where edges are compared with the interior
 COLUMNS = 128  # readings whose covariances are computed at once
 INTERIOR, EDGES = 9, 4  # levels of noise at which the two are computed; others follow from them
 EVEN, EVEN_EDGES = 1e-3, 0.1  # range of levels, logarithms, that count as one
@@ -97,8 +98,11 @@ def moments(matrix: sparse.csr_array, spectrum: FloatArray, detail: int) -> Mome
 
 def prior_precision(prior: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Return P0^-1 of a small frame as a matrix, (N, N), from 1 / its spectrum under the DCT-II."""
-    waves = np.kron(*(np.asarray(fft.dct(np.eye(size), 2, axis=0, norm="ortho")) for size in shape))
-    return np.asarray(waves.T @ (prior.ravel()[:, None] * waves), dtype=np.float64)
+    down, across = (cosine_waves(size) for size in shape)
+    pairs = [(waves[:, None, :] * waves[None, :, :]).reshape(-1, waves.shape[1]) for waves in (down, across)]
+    (rows, columns), count = shape, shape[0] * shape[1]
+    products = (pairs[0] @ prior @ pairs[1].T).reshape(rows, rows, columns, columns)
+    return np.ascontiguousarray(products.transpose(0, 2, 1, 3)).reshape(count, count)
 
 
 def columns_of_covariance(
@@ -183,32 +187,87 @@ class SmallFrame:
 
 
 @dataclass(frozen=True)
-class SmallFrames:
-    """Maps of a frame from small ones with the same edges, whose middle represents any interior.
+class Interior:
+    """Pixels that are far from the edges of a frame: its maps as a sum over frames of reflecting edges.
 
-    Where lens types leave a null space, errors of waves that these do not see reach from edge to edge. An edge has as
-    many such waves in a frame of any length n, so that their part in a variance falls with 1 / n, which two lengths
-    show.
+    Such edges raise the mean of a map by a part that falls with 1 / n, the number of lines, which n and 2 n show.
     """
 
-    shape: tuple[int, int]
-    parts: list[tuple[float, SmallFrame]]
+    parts: list[tuple[float, Bands]]
 
     @classmethod
-    def of(cls, task: EstimationTask, bands: Bands, *, far: bool) -> SmallFrames:
-        """Return those of a task's frame; far : True where errors reach from edge to edge."""
-        side = LONG if far else FINE_SIDE if task.finer > 1 else SIDE
-        lengths = product(*(_lengths(size, side, far=far) for size in bands.shape))
-        parts = [(one * two, _with_shape(bands, task, (down, across))) for (down, one), (across, two) in lengths]
-        return cls(bands.shape, [(share, SmallFrame(like)) for share, like in parts])
-
-    def maps(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
-        """Return the three maps for all weights times `level`: (3, rows, columns)."""
-        found = [
-            np.stack([_enlarged(each, self.shape) for each in small.maps(level, ratios)]) for _, small in self.parts
+    def of(cls, task: EstimationTask, bands: Bands, axes: tuple[int, ...] = (0, 1)) -> Interior:
+        """Return that of a task's frame; axes : along which it is to have no edges."""
+        sizes = [
+            [(2 * GRID, 2.0), (GRID, -1.0)] if axis in axes else [(size, 1.0)] for axis, size in enumerate(bands.shape)
         ]
-        total = sum((share * each for (share, _), each in zip(self.parts, found, strict=True)), np.zeros_like(found[0]))
-        return np.maximum(total, LEAST_SHARE * found[0])
+        return cls(
+            [(one * two, _with_shape(bands, task, (rows, columns))) for (rows, one), (columns, two) in product(*sizes)]
+        )
+
+    def variances(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return the three maps' value for all weights times `level`: (3,)."""
+        total = sum((share * np.array(like.variances(level, ratios)) for share, like in self.parts), np.zeros(3))
+        return _positive(total)
+
+
+def _positive(maps: FloatArray) -> FloatArray:
+    """Return three maps whose parts by prior and noise are no less than their rounding: (3,)."""
+    return np.maximum(maps, max(LEAST * float(maps[0]), np.finfo(float).tiny))
+
+
+class Edges:
+    """Ratios of a frame's maps to those far from its edges, by strips from edge to edge and a small frame at corners.
+
+    A strip has edges along one axis alone. Where two edges meet, the product of both strips' ratios is corrected by
+    what a small frame shows in place of that of strips of its size.
+    """
+
+    def __init__(self, task: EstimationTask, bands: Bands, *, quick: bool = False) -> None:
+        """Prepare the strips and the small frame of a task's frame; quick : True where its mean alone matters."""
+        most = max(LINES // task.finer**2, LEAST_LINES)
+        side = FINE_SIDE if task.finer > 1 else QUICK_SIDE if quick else SIDE
+        self.shape = bands.shape
+        self.near = min(bands.shape[0], side), min(bands.shape[1], side)
+        self._interior, self._corners = Interior.of(task, bands), SmallFrame(_with_shape(bands, task, self.near))
+        self._strips: dict[tuple[int, int], tuple[Bands, Interior]] = {}
+        for axis, size in (*enumerate(self.shape), *enumerate(self.near)):
+            shape = (min(size, most), ALONG) if axis == 0 else (ALONG, min(size, most))
+            like = _with_shape(bands, task, shape)
+            self._strips[axis, size] = like, Interior.of(task, like, (axis,))
+
+    def ratios(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return the ratios of the three maps for all weights times `level`: (3, rows, columns)."""
+        small = self._corners.maps(level, ratios) / self._interior.variances(level, ratios)[:, None, None]
+        small /= self._product(self.near, level, ratios)
+        return self._product(self.shape, level, ratios) * _in_corners(small, self.shape)
+
+    def _product(self, shape: tuple[int, int], level: float, ratios: tuple[float, ...]) -> FloatArray:
+        down, right = (self._across(axis, size, level, ratios) for axis, size in enumerate(shape))
+        return down[:, :, None] * right[:, None, :]
+
+    def _across(self, axis: int, size: int, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return the ratios of lines between two edges that are `size` lines apart: (3, size)."""
+        like, interior = self._strips[axis, size]
+        lines = like.variances_across(axis, level, ratios)
+        count = lines.shape[1]
+        middle = interior.variances(level, ratios) if count == size else lines[:, count // 2]
+        return lines[:, _small_index(size, count)] / _positive(middle)[:, None]
+
+
+def _in_corners(small: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Return the quarters of a small frame's maps at the corners of a large one, 1 elsewhere: (3, rows, columns)."""
+    total = np.ones((3, *shape))
+    down, right = (_ends(*sizes) for sizes in zip(shape, small.shape[1:], strict=True))
+    for (rows, of_rows), (columns, of_columns) in product(down, right):
+        total[:, rows, columns] = small[:, of_rows, of_columns]
+    return total
+
+
+def _ends(size: int, side: int) -> list[tuple[slice, slice]]:
+    """Return the ends of an axis of `size` pixels and those of one of `side`."""
+    near, far = side // 2, side - side // 2
+    return [(slice(0, near), slice(0, near)), (slice(size - far, size), slice(side - far, side))]
 
 
 @dataclass(frozen=True)
@@ -225,6 +284,7 @@ class Strips:
     shape: tuple[int, int]
     prior: float
     along: tuple[SmallFrame, SmallFrame]
+    interior: Interior
 
     @classmethod
     def of(cls, task: EstimationTask, bands: Bands, prior: float) -> Strips:
@@ -233,10 +293,10 @@ class Strips:
         rows, columns = bands.shape
         left, top = (rows, min(2 * deep, columns)), (min(2 * deep, rows), columns)
         along = tuple(SmallFrame(_with_shape(bands, task, each)) for each in (left, top))
-        return cls(bands.shape, prior, (along[0], along[1]))
+        return cls(bands.shape, prior, (along[0], along[1]), Interior.of(task, bands))
 
-    def maps(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
-        """Return the three maps for all weights times `level`: (3, rows, columns)."""
+    def ratios(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return the ratios of the three maps for all weights times `level`: (3, rows, columns)."""
         total = np.zeros((3, *self.shape))
         for axis, frame in zip((1, 0), self.along, strict=True):
             size, wide = self.shape[axis], frame.like.shape[axis]
@@ -249,7 +309,8 @@ class Strips:
                 place = view[:, :, :half] if first == 0 else view[:, :, size - half :]
                 np.copyto(place, kept, where=kept[0] > place[0])
         middle = total[:, self.shape[0] // 2, min(self.along[0].like.shape[1] // 4 - 1, self.shape[1] // 2)]
-        return np.where(total[0] > 0, total, middle[:, None, None])
+        total = np.where(total[0] > 0, total, middle[:, None, None])
+        return total / self.interior.variances(level, ratios)[:, None, None]
 
     def _strip(self, frame: SmallFrame, level: float, ratios: tuple[float, ...], axis: int, lines: slice) -> FloatArray:
         """Return the maps of lines of a frame along its edge: (3, length, depth)."""
@@ -261,38 +322,35 @@ class Strips:
         return swept_maps(matrix, level * weights, every, self.prior, pixels.shape, reach)
 
 
-def frame_map(task: EstimationTask, system: FrameSystem, bands: Bands, actual: FloatArray, *, far: bool) -> VarianceMap:
+def frame_map(
+    task: EstimationTask, system: FrameSystem, bands: Bands, actual: FloatArray, *, swept: bool, quick: bool = False
+) -> VarianceMap:
     """Return the map of a frame whose lens types see the same everywhere, as `bands` do.
 
-    actual : (measurements used,) noise;  far : True where errors reach from edge to edge
+    actual : (measurements used,) noise;  swept : True takes whole strips along the edges, of independent pixels
+    quick : True where the mean of the map alone matters
     """
     ratios, shape = mean_ratios(task, system.weights, actual), bands.shape
-    grid = without_edges(task, bands)
-    if isinstance(system.prior, float) and is_narrow(task) and not far:
-        even = Strips.of(task, bands, system.prior)
-    else:
-        even = SmallFrames.of(task, bands, far=far)
-
-    def interior(value: float) -> FloatArray:
-        return np.array(grid.variances(float(np.exp(value)), ratios))[:, None, None]
+    interior = Interior.of(task, bands)
+    edges = Strips.of(task, bands, float(np.asarray(system.prior))) if swept else Edges(task, bands, quick=quick)
 
     def inside(value: float) -> FloatArray:
-        return np.broadcast_to(interior(value), (3, *shape))
+        return np.broadcast_to(interior.variances(float(np.exp(value)), ratios)[:, None, None], (3, *shape))
 
-    def edges(value: float) -> FloatArray:
-        return even.maps(float(np.exp(value)), ratios) / np.maximum(interior(value), np.finfo(float).tiny)
+    def at_edges(value: float) -> FloatArray:
+        return edges.ratios(float(np.exp(value)), ratios)
 
-    return by_levels(np.log(system.levels(task.of_f)).reshape(shape), inside, edges)
+    return by_levels(np.log(system.levels(task.of_f)).reshape(shape), inside, at_edges)
 
 
 def ways_to_edges(task: EstimationTask, bands: Bands) -> list[bool]:
-    """Return whether errors reach from edge to edge; both, the faster one first, where that depends on the noise.
+    """Return whether the map is to be `swept`; both, the faster one first, where the better one depends on the noise.
 
-    They do where lens types leave a null space, and may along edges that some of them do not see.
+    Errors reach from edge to edge where lens types leave a null space, and may along edges that some do not see.
     """
-    if task.finer > 1 or leaves_null_space(task.model.camera):
-        return [task.finer == 1]
-    return [False] if is_narrow(task) or not unseen_corners(bands) else [False, True]
+    if not is_narrow(task) or leaves_null_space(task.model.camera):
+        return [False]
+    return [True, False] if unseen_corners(bands) else [True]
 
 
 def is_narrow(task: EstimationTask) -> bool:
@@ -315,11 +373,6 @@ def is_uneven(task: EstimationTask, system: FrameSystem) -> bool:
     return float(np.ptp(np.log(system.levels(task.of_f)))) > EVEN_EDGES
 
 
-def without_edges(task: EstimationTask, bands: Bands) -> Bands:
-    """Return bands of few enough waves for the variances of pixels far from the edges."""
-    return _with_shape(bands, task, (min(GRID, bands.shape[0]), min(GRID, bands.shape[1])))
-
-
 def _with_shape(bands: Bands, task: EstimationTask, shape: tuple[int, int]) -> Bands:
     """Return the bands of a smaller frame with the same edges."""
     by = bands.shape[0] - shape[0], bands.shape[1] - shape[1]
@@ -327,14 +380,6 @@ def _with_shape(bands: Bands, task: EstimationTask, shape: tuple[int, int]) -> B
     spectrum = np.broadcast_to(1 / np.asarray(task.precision_on(fine)), fine)
     types = tuple(each.shortened(by) for each in bands.types)
     return replace(bands, shape=shape, spectrum=spectrum, types=types, scale=1.0)
-
-
-def _lengths(size: int, side: int, *, far: bool) -> list[tuple[int, float]]:
-    """Return the sides of small frames along an axis and their shares in the variances of the large one."""
-    if not far or size <= side:
-        return [(min(side, size), 1.0)]
-    share = (1 / size - 1 / LONG) / (1 / SHORT - 1 / LONG)
-    return [(LONG, 1 - share), (SHORT, share)]
 
 
 def by_levels(level: FloatArray, inside: Maps, edges: Maps) -> VarianceMap:
@@ -371,11 +416,6 @@ def mean_ratios(task: EstimationTask, weights: FloatArray, actual: FloatArray) -
     ratios = task.on_all_measurements(actual / task.expected_noise, 0.0)
     parts = [(weights[part], ratios[part]) for part in task.model.camera.type_slices()]
     return tuple(float(np.mean(weight * ratio)) / (float(weight.mean()) or 1.0) for weight, ratio in parts)
-
-
-def _enlarged(variance: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Return the map of a small frame for a frame of `shape`."""
-    return variance[np.ix_(*(_small_index(*sizes) for sizes in zip(shape, variance.shape, strict=True)))]
 
 
 def _small_index(size: int, side: int) -> NDArray[np.intp]:

@@ -27,6 +27,7 @@ from ..methods.method import EstimationTask
 from .bands import Bands
 from .swept import swept_maps
 from .variance_map import (
+    Interior,
     VarianceMap,
     columns_of_covariance,
     dense_or_sparse,
@@ -35,7 +36,6 @@ from .variance_map import (
     mean_ratios,
     moments,
     prior_precision,
-    without_edges,
 )
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
@@ -306,12 +306,17 @@ def windows_map(task: EstimationTask, weights: FloatArray, bands: Bands, actual:
 
     weights : (M,) 1 / Rv;  bands : of a camera like this one;  actual : (measurements used,) noise
     """
-    beside = without_edges(task, bands).variances(1.0, mean_ratios(task, weights, actual))[0]
+    beside = float(Interior.of(task, bands).variances(1.0, mean_ratios(task, weights, actual))[0])
     core = (CORE, CORE)
     if is_narrow(task):
         widest = max(ceil(each.ratio) for each in task.model.camera.types)
         core, halo = (LENGTH, SWEPT), max(halo, BOXES * widest)
     return Windows(task, actual, core, halo, beside).frame(task.model.applied)
+
+
+def varies_over_field(observation: Observation) -> bool:
+    """Return True if kernels vary over the field by more than the map of their means allows for."""
+    return any(isinstance(part, KernelFootprints) and part.variation > VARYING for part in observation.parts)
 
 
 def by_windows(

@@ -129,7 +129,8 @@ class Prepared:
 class Execution:
     """Workers for parallel tasks (default: threads of this process), a callback for progress, and what frames share.
 
-    quick : True takes the fastest map of a frame's error, where its mean alone is compared with that of another model
+    quick : True takes a frame's error from transfer functions alone, those of the mean camera, and no residual's: for
+        predictions, and where the error is compared with that of another model
     """
 
     workers: Workers | None = None

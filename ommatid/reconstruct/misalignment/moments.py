@@ -149,14 +149,6 @@ def _add_squares(
         block += weight * (square + np.outer(of_mean[rows], of_mean[rows]))
 
 
-def misalignment_variance(form: Form, used: BoolArray, camera: Camera, prior: Prior) -> FloatArray:
-    """Return what misalignment adds to Eq. 5: (N,).
-
-    form : of the camera's designed H, for the measurements `used`, (M,)
-    """
-    return mismatch_variance(form, used, misaligned_moments(camera, prior), camera.slices(), prior)
-
-
 def mismatch_variance(
     form: Form, used: BoolArray, moments: MisalignedMoments, slices: list[slice], prior: Prior
 ) -> FloatArray:

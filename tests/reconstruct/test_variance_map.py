@@ -111,7 +111,11 @@ def test_actual_noise_that_differs_from_the_expected_one(case: str) -> None:
         maps = swept_maps(matrix, system.weights, noise / 1e-2, 1 / P0, shape, 5)
     else:
         make = windows_map(task, system.weights, system.bands, noise, 28) if case == "windows" else None
-        found = frame_map(task, system, system.bands, noise, swept=case == "strips") if make is None else make
+        found = (
+            frame_map(task, system, system.bands, noise, "swept" if case == "strips" else "edges")
+            if make is None
+            else make
+        )
         maps = np.array([found.posterior, found.missing, found.noisy])
     prior = np.eye(shape[0] * shape[1]) / P0
     if case in ("small frame", "windows"):
@@ -182,7 +186,7 @@ def test_kernels_that_vary_over_the_field() -> None:
     observation = replace(observation, parts=(*parts, *observation.parts[1:]))
     system = replace(system_of(task), observation=observation)
     assert system.bands is not None
-    maps = frame_map(task, system, system.bands, task.expected_noise, swept=False)
+    maps = frame_map(task, system, system.bands, task.expected_noise, "edges")
     variance = by_windows(maps, task, observation, task.expected_noise).posterior
     for place in ((0, 0), (41, 44), (41, 0), (82, 30), (20, 60), (60, 89), (5, 70), (70, 12)):
         unit = np.zeros(shape)

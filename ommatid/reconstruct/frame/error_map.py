@@ -169,7 +169,7 @@ def _is_small(task: EstimationTask, readings: int) -> bool:
 def _fastest_map(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> VarianceMap:
     if system.bands is None:
         return next(_maps(task, system, actual))
-    return frame_map(task, system, system.bands, actual, swept=ways_to_edges(task, system.bands)[0], quick=True)
+    return frame_map(task, system, system.bands, actual, ways_to_edges(task, system.bands)[0], quick=True)
 
 
 def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iterator[VarianceMap]:
@@ -185,8 +185,8 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
     uneven = is_uneven(task, system)
     if is_invariant(task) and not (narrow and uneven):
         varies = varies_over_field(task.model.applied)
-        for swept in ways_to_edges(task, system.bands):
-            maps = frame_map(task, system, system.bands, actual, swept=swept)
+        for way in ways_to_edges(task, system.bands):
+            maps = frame_map(task, system, system.bands, actual, way)
             maps = by_windows(maps, task, task.model.applied, actual) if varies else maps
             yield _with_corners(maps, task, system, actual) if narrow else maps
         if not few or task.finer > 1 or not (varies or uneven):

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,14 @@ LINES, LEAST_LINES = 120, 24  # of f between the edges of a strip: for a world a
 ALONG = 64  # pixels of f along it, which has no edges there
 GRID = 64  # pixels of f along an axis of a frame of reflecting edges
 DEEP = 9  # of a strip along an edge, in kernels; half of it is used
+LONG, SHORT = 60, 44  # of small frames from which the effect of the length follows
+LEAST_SHARE = 0.1  # of a variance in the longest of them, which that in a large one is at least
 LEAST = 1e-10  # of the posterior variance, that its parts are where edges are compared with the interior
 COLUMNS = 128  # readings whose covariances are computed at once
 INTERIOR, EDGES = 9, 4  # levels of noise at which the two are computed; others follow from them
 EVEN, EVEN_EDGES = 1e-3, 0.1  # range of levels, logarithms, that count as one
 
+Way = Literal["edges", "far", "swept"]  # strips and a corner, small frames, or whole strips of independent pixels
 Maps = Callable[[float], FloatArray]  # from the logarithm of a level to three maps
 
 
@@ -271,6 +275,34 @@ def _ends(size: int, side: int) -> list[tuple[slice, slice]]:
 
 
 @dataclass(frozen=True)
+class SmallFrames:
+    """Ratios of a frame whose errors reach from edge to edge, by small ones with the same edges.
+
+    Where lens types leave a null space, no lens type sees some waves. An edge has as many of them in a frame of any
+    length n, so that their part in a variance falls with 1 / n, which two lengths show.
+    """
+
+    shape: tuple[int, int]
+    parts: list[tuple[float, SmallFrame]]
+    interior: Interior
+
+    @classmethod
+    def of(cls, task: EstimationTask, bands: Bands) -> SmallFrames:
+        """Return those of a task's frame."""
+        lengths = product(*map(_lengths, bands.shape))
+        parts = [(one * two, _with_shape(bands, task, (down, across))) for (down, one), (across, two) in lengths]
+        return cls(bands.shape, [(share, SmallFrame(like)) for share, like in parts], Interior.of(task, bands))
+
+    def ratios(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
+        """Return the ratios of the three maps for all weights times `level`: (3, rows, columns)."""
+        found = [
+            np.stack([_enlarged(each, self.shape) for each in small.maps(level, ratios)]) for _, small in self.parts
+        ]
+        total = sum((share * each for (share, _), each in zip(self.parts, found, strict=True)), np.zeros_like(found[0]))
+        return np.maximum(total, LEAST_SHARE * found[0]) / self.interior.variances(level, ratios)[:, None, None]
+
+
+@dataclass(frozen=True)
 class Strips:
     """Maps of a frame of independent pixels from strips along its edges, as long as these.
 
@@ -323,16 +355,22 @@ class Strips:
 
 
 def frame_map(
-    task: EstimationTask, system: FrameSystem, bands: Bands, actual: FloatArray, *, swept: bool, quick: bool = False
+    task: EstimationTask, system: FrameSystem, bands: Bands, actual: FloatArray, way: Way, *, quick: bool = False
 ) -> VarianceMap:
     """Return the map of a frame whose lens types see the same everywhere, as `bands` do.
 
-    actual : (measurements used,) noise;  swept : True takes whole strips along the edges, of independent pixels
+    actual : (measurements used,) noise;  way : to the ratios near the edges, one of `ways_to_edges`
     quick : True where the mean of the map alone matters
     """
     ratios, shape = mean_ratios(task, system.weights, actual), bands.shape
     interior = Interior.of(task, bands)
-    edges = Strips.of(task, bands, float(np.asarray(system.prior))) if swept else Edges(task, bands, quick=quick)
+    edges: Edges | SmallFrames | Strips
+    if way == "edges":
+        edges = Edges(task, bands, quick=quick)
+    elif way == "far":
+        edges = SmallFrames.of(task, bands)
+    else:
+        edges = Strips.of(task, bands, float(np.asarray(system.prior)))
 
     def inside(value: float) -> FloatArray:
         return np.broadcast_to(interior.variances(float(np.exp(value)), ratios)[:, None, None], (3, *shape))
@@ -343,14 +381,17 @@ def frame_map(
     return by_levels(np.log(system.levels(task.of_f)).reshape(shape), inside, at_edges)
 
 
-def ways_to_edges(task: EstimationTask, bands: Bands) -> list[bool]:
-    """Return whether the map is to be `swept`; both, the faster one first, where the better one depends on the noise.
+def ways_to_edges(task: EstimationTask, bands: Bands) -> list[Way]:
+    """Return the ways to the ratios near the edges, the faster one first, where the better one depends on the noise.
 
-    Errors reach from edge to edge where lens types leave a null space, and may along edges that some do not see.
+    Errors reach from edge to edge where lens types leave a null space, and may along edges that some do not see; those
+    of independent pixels do so undamped.
     """
-    if not is_narrow(task) or leaves_null_space(task.model.camera):
-        return [False]
-    return [True, False] if unseen_corners(bands) else [True]
+    null_space = task.finer == 1 and leaves_null_space(task.model.camera)
+    if null_space and task.prior.kind == "independent":
+        return ["far"]
+    far: list[Way] = ["far"] if task.finer == 1 and (null_space or unseen_corners(bands)) else []
+    return ["swept" if is_narrow(task) else "edges", *far]
 
 
 def is_narrow(task: EstimationTask) -> bool:
@@ -380,6 +421,14 @@ def _with_shape(bands: Bands, task: EstimationTask, shape: tuple[int, int]) -> B
     spectrum = np.broadcast_to(1 / np.asarray(task.precision_on(fine)), fine)
     types = tuple(each.shortened(by) for each in bands.types)
     return replace(bands, shape=shape, spectrum=spectrum, types=types, scale=1.0)
+
+
+def _lengths(size: int) -> list[tuple[int, float]]:
+    """Return the sides of small frames along an axis and their shares in the variances of the large one."""
+    if size <= LONG:
+        return [(size, 1.0)]
+    share = (1 / size - 1 / LONG) / (1 / SHORT - 1 / LONG)
+    return [(LONG, 1 - share), (SHORT, share)]
 
 
 def by_levels(level: FloatArray, inside: Maps, edges: Maps) -> VarianceMap:
@@ -416,6 +465,11 @@ def mean_ratios(task: EstimationTask, weights: FloatArray, actual: FloatArray) -
     ratios = task.on_all_measurements(actual / task.expected_noise, 0.0)
     parts = [(weights[part], ratios[part]) for part in task.model.camera.type_slices()]
     return tuple(float(np.mean(weight * ratio)) / (float(weight.mean()) or 1.0) for weight, ratio in parts)
+
+
+def _enlarged(variance: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """Return the map of a small frame for a frame of `shape`."""
+    return variance[np.ix_(*(_small_index(*sizes) for sizes in zip(shape, variance.shape, strict=True)))]
 
 
 def _small_index(size: int, side: int) -> NDArray[np.intp]:

@@ -46,7 +46,7 @@ def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, A
     """Tabulate a prediction, and the electrons that the pixels collect where the scene has a sensor."""
     lines, tolerance = prediction_table.rows(prediction), scene.camera.tolerance
     if (
-        predict.LEFT_OUT in prediction.assumes
+        any(sentence.startswith(predict.LEFT_OUT) for sentence in prediction.assumes)
         and tolerance is not None
         and prediction.misalignment is None
         and scene.estimator.misalignment == "trust"

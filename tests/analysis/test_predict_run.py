@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ommatid.analysis.predict import needs_no_rays, predict_scene
+from ommatid.analysis.predict import FIXED, needs_no_rays, predict_scene
 from ommatid.analysis.predicted_recording import predicted_recording
 from ommatid.analysis.prediction_table import json_of, rows
 from ommatid.reconstruct.expected_error import expected_error
@@ -204,6 +204,15 @@ def test_adaptive_samples_of_a_camera_that_sees_the_same_everywhere_need_no_rays
     ):
         assert not needs_no_rays(Setup.from_scene(read(TILE, (change,)))), change
     assert not needs_no_rays(Setup.from_scene(read(GALLERY / "corridor.toml")))
+    assert needs_no_rays(Setup.from_scene(read(GALLERY / "sensor119.toml"))), "its entries took 23 GB"
+
+
+def test_fixed_samples_behind_blurred_lenses_are_left_out_and_the_interval_with_them() -> None:
+    blurred = read(GALLERY / "sensor119.toml", ("target.detail=1",))
+    prediction = predict_scene(blurred)
+    assert prediction.assumes[0] == FIXED
+    assert prediction.mse == predict_scene(blurred, rays=False).mse
+    assert (prediction.mse_for_picture, prediction.interval) == (None, None)
 
 
 def test_it_says_where_nothing_is_recovered(ommatid: Command) -> None:

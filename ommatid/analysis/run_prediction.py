@@ -14,6 +14,8 @@ import numpy as np
 
 from ommatid.reconstruct.assumptions import Assumptions, assumptions_at, assumptions_for, with_fallback
 from ommatid.reconstruct.coarse_model import model_of_f
+from ommatid.reconstruct.frame.conjugate_gradients import leaves_null_space
+from ommatid.reconstruct.frame.frame_method import FrameMethod
 from ommatid.reconstruct.frame.windows import varies_over_field
 from ommatid.reconstruct.method_choice import METHODS, MethodChoice
 from ommatid.reconstruct.methods.dense_method import DenseMethod
@@ -86,21 +88,24 @@ def predict_without_rays(setup: Setup, assumes: tuple[str, ...]) -> Prediction:
     assumes : what is taken for granted, which the prediction says first
     Raises InputError where H has no closed form.
     """
-    recording = recording_without_rays(setup)
-    stack, model, said = recording.stack, recording.model, list(assumes)
+    recording, camera = recording_without_rays(setup), setup.camera
+    stack, model = recording.stack, recording.model
+    alike = camera.is_sliding and camera.tolerance is None and not leaves_null_space(camera)
 
     def work(choice: MethodChoice) -> _Outcome:
-        quick = choice.method == "frame" and setup.camera.is_sliding and setup.camera.tolerance is None
+        quick = alike and choice.method == "frame"
         assumed = assumptions_at(stack, model, choice, recording.image, Execution(quick=quick))
         if quick and undithered(assumed.noise) is not None:
+            # Errors of rounding that measurements share depend on the readings.
             assumed = assumptions_at(stack, model, choice, recording.image, Execution())
-        elif quick:
-            said.append(BY_MEANS if varies_over_field(model.applied) else BY_TRANSFER)
         truth = truth_for(assumed.method, recording.truth, stack.camera)
         return _Outcome(choice, assumed, assumed.result(truth))
 
     outcome = with_fallback(stack, model, work)
-    return _prediction(setup, replace(recording, assumes=(*said, *recording.assumes)), outcome)
+    method = outcome.assumed.method
+    if isinstance(method, FrameMethod) and method.quick_bands is not None:
+        assumes = (*assumes, BY_MEANS if varies_over_field(model.applied) else BY_TRANSFER)
+    return _prediction(setup, replace(recording, assumes=(*assumes, *recording.assumes)), outcome)
 
 
 def _mse_with(setup: Setup, method: str, prediction: Prediction) -> float:

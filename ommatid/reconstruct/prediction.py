@@ -15,7 +15,6 @@ from .measured_error import TRIM, trimmed_mean
 from .problem import gram
 
 PRIOR_ALONE = 0.9  # of the prior's variance: error from which measurements bring next to nothing
-NOISELESS = 1e-12  # of a measurement's prior variance: noise in place of none that an estimator expects where some is
 RANK_TOLERANCE = 1e-7  # of singular values, relative; their squares come from an eigenvalue problem in float64
 
 

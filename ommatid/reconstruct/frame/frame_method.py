@@ -127,8 +127,8 @@ class FrameMethod(Method):
         """Return C P0^-1 1, (unknowns,), to the accuracy of the estimate for an image of this value."""
         constant = np.full(self.task.model.unknowns, value)
         right = self.system.apply_prior_precision(constant)
-        if self._quick_bands is not None:
-            return self._quick_bands.solve(right.reshape(self.task.shape)).ravel() / value
+        if self.quick_bands is not None:
+            return self.quick_bands.solve(right.reshape(self.task.shape)).ravel() / value
         return self.system.solve(right, self.task.settings.accuracy).image / value
 
     def operators(self) -> PosteriorOperators:
@@ -194,7 +194,7 @@ class FrameMethod(Method):
 
     def _by_detail(self) -> float:
         """Return the mean squared error by what f does not hold of a random world of the prior."""
-        task, bands = self.task, self._quick_bands
+        task, bands = self.task, self.quick_bands
         if bands is not None:
             return bands.detail_variance()
         rng, spectrum = probe(Purpose.DETAIL), 1 / np.asarray(task.precision_on(task.shape))
@@ -206,7 +206,7 @@ class FrameMethod(Method):
         return squares / self._draws
 
     @property
-    def _quick_bands(self) -> Bands | None:
+    def quick_bands(self) -> Bands | None:
         """The camera's transfer functions where they are enough, None where random images are to be solved for."""
         return self.system.bands if self.execution.quick else None
 
@@ -287,7 +287,7 @@ class FrameMethod(Method):
 
     def _parts(self, noise: dict[str, FloatArray], mean: float) -> dict[str, float]:
         """Share of each cause of noise in the mean of Eq. 5; they add up to `mean`."""
-        rng, bands = probe(Purpose.ERROR_PARTS), self._quick_bands
+        rng, bands = probe(Purpose.ERROR_PARTS), self.quick_bands
         parts: dict[str, float] = {}
         uniform: tuple[float, float] | None = None  # a uniform variance and its part
         for name, values in noise.items():
@@ -315,8 +315,8 @@ class FrameMethod(Method):
         """Interval of the mean squared error of the true image; that less its prior's mean is `deviation`."""
         task, system, count = self.task, self.system, expected.variance.size
         noisy = count * sum(part for name, part in expected.parts.items() if name != DETAIL)  # the world is known
-        if self._quick_bands is not None:
-            lost, variance = self._by_waves(self._quick_bands, deviation, actual, variances)
+        if self.quick_bands is not None:
+            lost, variance = self._by_waves(self.quick_bands, deviation, actual, variances)
             return interval(lost + noisy, variance + (map_error * noisy) ** 2, count)
         bias = task.of_f(self._solve(system.apply_prior_precision(deviation)))
         along = float(actual @ np.square(self._transposed_gain(task.of_unknowns(bias))))

@@ -200,12 +200,13 @@ def assumptions_for(stack: Stack, model: Model, choice: MethodChoice, execution:
     assumed = _assumptions(stack, model, usable, choice, execution)
     if not usable.saturated:
         return assumed
-    image = assumed.method.image
+    image = assumed.method.preliminary_image
     for _ in range(ROUNDS):
         of_image = assumed.method.task.model
         values, pixels = censored(stack, of_image, usable, image, assumed.fit)
+        execution = replace(execution, nearby=assumed.method.nearby)
         assumed = _assumptions(values, model, pixels, choice, execution)
-        before, image = of_image.forward(image), assumed.method.image
+        before, image = of_image.forward(image), assumed.method.preliminary_image
         if has_converged(before, assumed.method.task.model.forward(image), stack, usable):
             break
     return assumed
@@ -233,13 +234,13 @@ def _assumptions(
     observation, noise, method, image = first, first.noise(), None, None
     if depends_on_light(stack, model) or SHARED in noise:
         method = preliminary(first, noise)
-        image = method.image
+        image = method.preliminary_image
         noise = first.noise(image, shared=SHARED in noise)
     fit = _fit(first, noise)
     if fit is not None and (model.variance.any() or SHARED in noise):
         # The uncertainty of H was taken at an image that the first prior had left noisy.
         better, fitted = _with_fit(first, model, noise, fit)
-        image = preliminary(better, fitted).image
+        image = preliminary(better, fitted).preliminary_image
         before, noise = total_variance(noise), better.noise(image, shared=SHARED in noise)
         if float(np.abs(total_variance(noise) - before).sum()) > NEGLIGIBLE * float(before.sum()):
             fit = _fit(first, noise)

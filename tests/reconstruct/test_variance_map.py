@@ -195,6 +195,19 @@ def test_kernels_that_vary_over_the_field() -> None:
         assert variance[place] == pytest.approx(solved[place], rel=0.02), place
 
 
+def test_some_windows_give_the_mean_error_of_another_camera() -> None:
+    """To 2 % of all windows, where a shift-invariant camera is a tenth off: arrays other than m x m."""
+    odd = (("1/3", [3, 2], "fit"), ("1/4", [4, 4], "fit"), ("1/5", [4, 5], "fit"))
+    task = task_of(wide((60, 47), odd, **CORRELATED), 1.0)
+    system = system_of(task)
+    assert system.bands is not None
+    like = frame_map(task, system, system.bands, task.expected_noise, "edges")
+    found = by_windows(like, task, task.model.applied, task.expected_noise, system.bands)
+    every = windows_map(task, system.weights, system.bands, task.expected_noise, 8)
+    assert found.variance.mean() == pytest.approx(every.variance.mean(), rel=0.02)
+    assert like.variance.mean() < 0.93 * every.variance.mean()
+
+
 @pytest.mark.parametrize("as_expected", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_one_solution_measures_the_variances_of_distant_pixels(as_expected: bool) -> None:
     """Against the dense Eq. 5, and a map that is 5 % off, or is none at a pixel that the check misses, is found."""

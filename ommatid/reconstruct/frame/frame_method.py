@@ -80,6 +80,10 @@ class FrameMethod(Method):
         """Raises InputError if a measurement has no noise."""
         super().__init__(task, execution)
         self._banded = task.finer == 1 and task.prior.kind == "independent" and serves(task.model.camera)
+        self._start, self._nearly = None, None  # solutions from which those of this method start
+        nearby = execution.nearby
+        if nearby is not None and nearby.image.size == task.model.unknowns:
+            self._start, self._nearly = nearby.image - task.prior.mean, nearby.response
         if not (task.expected_noise > 0).all():
             raise InputError(
                 "estimator.method 'frame' needs noise in every measurement; set estimator.noise_variance above 0"
@@ -113,11 +117,22 @@ class FrameMethod(Method):
     @cached_property
     def solution(self) -> Solution:
         """The solution f^ - f0."""
+        accuracy, progress = self.task.settings.accuracy, self.execution.progress
+        return self.system.solve(self._right, accuracy, lambda done: progress(SOLVING * done), self._start)
+
+    @cached_property
+    def preliminary_of_mean(self) -> FloatArray:
+        """The estimate where the image's level is the prior's mean, to the accuracy of means over the image: (N,)."""
+        self._start = self.system.solve(self._right, mean_accuracy(self.task), start=self._start).image
+        return self._start + self.task.prior.mean
+
+    @property
+    def _right(self) -> FloatArray:
+        """The right-hand side of the solution."""
         task = self.task
         recorded = task.recorded if task.complete else np.where(task.used, task.recorded, 0.0)
         mean = self.system.observation.forward(np.full(task.model.unknowns, task.prior.mean))
-        right = self.system.right_hand_side(np.subtract(recorded, mean, out=mean))
-        return self.system.solve(right, task.settings.accuracy, lambda done: self.execution.progress(SOLVING * done))
+        return self.system.right_hand_side(np.subtract(recorded, mean, out=mean))
 
     def estimate_image(self) -> FloatArray:
         """Compute f^ without its error: (N,)."""
@@ -129,7 +144,8 @@ class FrameMethod(Method):
         right = self.system.apply_prior_precision(constant)
         if self.quick_bands is not None:
             return self.quick_bands.solve(right.reshape(self.task.shape)).ravel() / value
-        return self.system.solve(right, self.task.settings.accuracy).image / value
+        start = None if self._nearly is None else value * self._nearly
+        return self.system.solve(right, self.task.settings.accuracy, start=start).image / value
 
     def operators(self) -> PosteriorOperators:
         """Return the operators of the estimate, to a mean error of a hundredth of a posterior standard deviation."""

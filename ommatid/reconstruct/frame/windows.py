@@ -43,6 +43,7 @@ HALOS = 8, 12, 16  # pixels of f around it, of which a longer one takes several 
 MOST_ENTRIES = 30_000_000  # of H of a part, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
 SIDE, WINDOWS = 28, 3  # pixels of f of a window that shows what the variation of kernels does; windows along each axis
+MORE_WINDOWS = 6  # the same where a camera is compared with a shift-invariant one
 Core = tuple[slice, ...]
 WHOLE = slice(None), slice(None)
 REPEATS = 5  # windows with the same footprints, from which one and how the others differ are faster than all
@@ -320,27 +321,49 @@ def varies_over_field(observation: Observation) -> bool:
 
 
 def by_windows(
-    variances: VarianceMap, task: EstimationTask, observation: Observation, actual: FloatArray
+    variances: VarianceMap,
+    task: EstimationTask,
+    observation: Observation,
+    actual: FloatArray,
+    bands: Bands | None = None,
 ) -> VarianceMap:
-    """Return the map of a camera whose kernels vary over the field from that of their means.
+    """Return the map of a camera from that of a shift-invariant one, `variances`.
 
-    Their ratios are those of windows that are imaged by either, from the same readings, and linear between these.
+    Their ratios are those of some windows, and linear between these: where kernels vary over the field, of the same
+    readings imaged by the kernels or by their means, else of the readings of a window to the map itself. The mean is
+    right then, and single pixels as far as the cameras are alike.
+
+    bands : of the shift-invariant camera, None where kernels vary
     """
-    shape = task.shape_of_f
-    side = min(SIDE, *shape)
-    starts = [np.unique(np.linspace(0, size - side, WINDOWS).round().astype(int)) for size in shape]
-    parts = [part.mean if isinstance(part, KernelFootprints) else part for part in observation.parts]
-    like = Observation(observation.shape, tuple(parts))
-    windows = Windows(task, actual, (side, side))
-    ratios = np.ones((3, len(starts[0]), len(starts[1])))
-    for row, column in np.ndindex(ratios.shape[1:]):
-        corner = int(starts[0][row]), int(starts[1][column])
+    shape, like = task.shape_of_f, None
+    side, beside, most = min(SIDE, *shape), 0.0, WINDOWS
+    if bands is None:
+        parts = [part.mean if isinstance(part, KernelFootprints) else part for part in observation.parts]
+        like = Observation(observation.shape, tuple(parts))
+    else:
+        beside, most = float(variances.posterior.mean()), MORE_WINDOWS
+    starts = [np.unique(np.linspace(0, size - side, most).round().astype(int)) for size in shape]
+    windows = Windows(task, actual, (side, side), beside=beside)
+
+    def ratio(corner: tuple[int, int]) -> FloatArray:
         core = tuple(
             slice(0 if first == 0 else HALOS[0], side if first + side == size else side - HALOS[0])
             for first, size in zip(corner, shape, strict=True)
         )
-        found, other = (windows.map(each, corner, core).mean(axis=(1, 2)) for each in (observation, like))
-        ratios[:, row, column] = np.divide(found, other, out=np.ones(3), where=other > 0)
+        found = windows.map(observation, corner, core).mean(axis=(1, 2))
+        if like is None:
+            place = tuple(
+                slice(first + part.start, first + part.stop) for first, part in zip(corner, core, strict=True)
+            )
+            maps = variances.posterior, variances.missing, variances.noisy
+            other = np.array([each[place].mean() for each in maps])
+        else:
+            other = windows.map(like, corner, core).mean(axis=(1, 2))
+        return np.divide(found, other, out=np.ones(3), where=other > 0)
+
+    with one_thread(), ThreadPoolExecutor(processors()) as threads:
+        corners = product(*(each.tolist() for each in starts))
+        ratios = np.array(list(threads.map(ratio, corners))).T.reshape(3, starts[0].size, starts[1].size)
     middles = [each + side / 2 for each in starts]
     down, across = (_interpolation(size, middle) for size, middle in zip(shape, middles, strict=True))
     whole = [down @ each @ across.T for each in ratios]

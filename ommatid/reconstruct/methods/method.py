@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import inf
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from scipy import fft, sparse
@@ -125,10 +125,21 @@ class Prepared:
         return copy
 
 
+class Nearby(NamedTuple):
+    """Solutions for nearly the same noise, from which those of a method may start.
+
+    image : (unknowns,) of an image of the prior's mean;  response : (unknowns,) h of its level, None without one
+    """
+
+    image: FloatArray
+    response: FloatArray | None
+
+
 @dataclass(frozen=True)
 class Execution:
     """Workers for parallel tasks (default: threads of this process), a callback for progress, and what frames share.
 
+    nearby : solutions for nearly the same noise, None where there are none
     quick : True takes a frame's error from transfer functions alone, those of the mean camera, and no residual's: for
         predictions, and where the error is compared with that of another model
     """
@@ -137,6 +148,7 @@ class Execution:
     progress: Progress = no_progress
     prepared: Prepared | None = None
     quick: bool = False
+    nearby: Nearby | None = None
 
 
 @dataclass(frozen=True)
@@ -345,13 +357,31 @@ class Method(ABC):
     @cached_property
     def image(self) -> FloatArray:
         """The estimate f^ without its error: (N,)."""
-        level = self.level
-        return self.image_of_mean if level is None else self.image_of_mean + level.value * level.response
+        return self._with_level(self.image_of_mean, self.level)
+
+    @cached_property
+    def preliminary_image(self) -> FloatArray:
+        """The estimate to the accuracy of means over the image, of which noise is taken: (N,)."""
+        return self._with_level(self.preliminary_of_mean, self._level_of(self.preliminary_of_mean))
+
+    @property
+    def nearby(self) -> Nearby:
+        """What a method for nearly the same noise may start from."""
+        return Nearby(self.preliminary_of_mean, self.response)
+
+    @staticmethod
+    def _with_level(image: FloatArray, level: Level | None) -> FloatArray:
+        return image if level is None else image + level.value * level.response
 
     @cached_property
     def image_of_mean(self) -> FloatArray:
         """The estimate where the image's level is the prior's mean: (N,)."""
         return self.estimate_image()
+
+    @cached_property
+    def preliminary_of_mean(self) -> FloatArray:
+        """The same to the accuracy of means over the image, where that is faster."""
+        return self.image_of_mean
 
     def observe(self, image: FloatArray) -> FloatArray:
         """Return H f by the H of the estimate: (N,) to (measurements used,), or with columns."""
@@ -364,14 +394,23 @@ class Method(ABC):
     @cached_property
     def level(self) -> Level | None:
         """The common level of the image, None where the prior knows it or this method takes it for known."""
-        deviation, task = self.task.prior.level_deviation, self.task
+        return self._level_of(self.image_of_mean)
+
+    @cached_property
+    def response(self) -> FloatArray | None:
+        """What the estimate lacks of a constant image, h, (unknowns,); None as for the level."""
+        deviation = self.task.prior.level_deviation
         if not deviation:
             return None
-        response, _ = self.shared("level", self.conditions(), lambda: self.left_of_constant(deviation))
+        return self.shared("level", self.conditions(), lambda: self.left_of_constant(deviation))[0]
+
+    def _level_of(self, image: FloatArray) -> Level | None:
+        """Return the level for an estimate of an image of the prior's mean."""
+        response, task = self.response, self.task
         if response is None:
             return None
         wave = float(np.ravel(1 / np.asarray(task.precision_on(task.shape)))[0])
-        return Level.of(self.image_of_mean - task.prior.mean, response, wave, deviation**2)
+        return Level.of(image - task.prior.mean, response, wave, task.prior.level_deviation**2)
 
     def left_of_constant(self, value: float) -> FloatArray | None:
         """Return C P0^-1 1, (unknowns,), as accurate as for an image of this value; None where there is no noise."""

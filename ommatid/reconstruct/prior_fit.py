@@ -11,7 +11,9 @@ with an unknown level of deviation L, the density
 
 t = 1 where the noise is known; Rv holds, too, what wide point spreads see beside the window, by one rank. The variance
 of a pixel, c, has before the stack the density that windows of natural pictures have. H P H^T, diagonalised once for
-each l and a, gives the evidence for every c and t; the windows count as independent (Stein, Chi and Welty 2004). Few
+each l and a, gives the evidence for every c and t; the windows count as independent (Stein, Chi and Welty 2004). All of
+them may lie in flat parts, bright and dark ones. Where means over parts of the image vary by far more than the fitted
+spectrum allows, they are measurements beside those of the windows. Few
 measurements and much noise leave the numbers open, above all how much the image holds at frequencies that no lens sees.
 So the prior is the mean of these spectra, weighted by their evidence: its covariance is that of images whose numbers
 are drawn from the posterior, and Eq. 5 holds on average over them. The exponents and lengths lie on a grid; c, and t
@@ -36,7 +38,7 @@ from ommatid.scenes.tables.estimation import PriorTable
 
 from .coarse_model import CoarseModel
 from .methods.method import EstimationTask
-from .prior import FittedPrior, SpectralTerm, natural_spectrum, spectrum_of
+from .prior import FittedPrior, SpectralTerm, averaged_spectrum, natural_spectrum, spectrum_of
 
 LENGTHS = (1.5, 4.0, 10.0, 25.0)  # pixels of f
 EXPONENTS = (1.0, 2.0, 3.0, 4.0)  # and 0, which has no length
@@ -54,6 +56,9 @@ REACH = 18.0  # logarithms from the mean square to either end
 BEYOND = 12.0  # units of log evidence below the largest, where the grid ends
 SEEN = 7.0  # units of log evidence by which an image must be more likely than none
 ROUNDING = 1 / 12  # variance of the noise of a picture's pixel, in squared grey levels
+PARTS, FEWEST_PARTS = 16, 4  # along an axis, of whose means the image at large is judged
+SAMPLES = 4  # along a side of such a part
+MOST_EXCESS = 20.0  # mean square of their waves relative to the fitted prior's; 7 of natural pictures, 200 of a horizon
 KEPT = 1e-3  # share of the variance, from which a term is kept
 REFINEMENTS = 2
 LEAST_NOISE = 1e-6  # of the known noise, that is fitted in addition to it
@@ -80,7 +85,7 @@ class PriorFit:
     flat: bool = False
 
 
-class _Spectrum(NamedTuple):
+class Spectrum(NamedTuple):
     """A spectrum on a window's grid, (rows, columns) of mean 1 unless it is known, its numbers, and a weight."""
 
     values: FloatArray
@@ -136,10 +141,10 @@ class Window:
         beside = float(left[0] @ left[0]), float(left[1] @ left[1]), float(left[0] @ left[1]), count
         return cls(np.asarray(kept, dtype=np.float64).reshape(-1, *shape), *turned, beside)
 
-    def evidence(self, spectrum: FloatArray) -> Evidence:
-        """Return the evidence of images with a spectrum, (rows, columns)."""
+    def evidence(self, spectrum: Spectrum) -> Evidence:
+        """Return the evidence of images with a spectrum."""
         flat = self.waves.reshape(len(self.waves), -1)
-        covariance = (flat * spectrum.ravel()) @ flat.T
+        covariance = (flat * spectrum.values.ravel()) @ flat.T
         values, vectors = linalg.eigh((covariance + covariance.T) / 2, check_finite=False, driver="evd")
         return Evidence(np.maximum(values, 0.0), vectors.T @ self.residual, vectors.T @ self.light, self.beside)
 
@@ -188,13 +193,77 @@ class _Picture:
 
     image: FloatArray
     level: float
+    noise: float = ROUNDING
 
-    def evidence(self, spectrum: FloatArray) -> Evidence:
-        """Return the evidence of a spectrum, (rows, columns): the waves of the picture are independent."""
-        residual = np.asarray(fft.dctn(self.image, 2, norm="ortho"), dtype=np.float64).ravel()
-        light = np.zeros(residual.size)
+    def evidence(self, spectrum: Spectrum) -> Evidence:
+        """Return the evidence of a spectrum: the waves of the picture are independent."""
+        return self._evidence(spectrum.values)
+
+    def _evidence(self, spectrum: FloatArray) -> Evidence:
+        """Return the evidence of a spectrum on the grid of the picture, (rows, columns)."""
+        light = np.zeros(self.image.size)
         light[0] = self.level * light.size**0.5
-        return Evidence(spectrum.ravel() / ROUNDING, residual / ROUNDING**0.5, light / ROUNDING**0.5, (0, 0, 0, 0))
+        parts = self.waves.ravel() / self.noise**0.5, light / self.noise**0.5
+        return Evidence(spectrum.ravel() / self.noise, *parts, (0, 0, 0, 0))
+
+    @property
+    def waves(self) -> FloatArray:
+        """The picture by its cosine waves."""
+        return np.asarray(fft.dctn(self.image, 2, norm="ortho"), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _PartMeans(_Picture):
+    """Means over parts of f, (rows, columns) less the prior's mean; their noise is small beside their differences.
+
+    side : pixels of the unknowns along a side of a part;  pitch : of these pixels
+    """
+
+    side: int = 1
+    pitch: float = 1.0
+
+    @classmethod
+    def of(cls, task: EstimationTask) -> _PartMeans | None:
+        """Return that of a task, from readings spread over the pixels that they see; None of an image of few parts."""
+        fine, detail = _unknowns(task), _detail(task)
+        side = detail * max(min(task.shape) // PARTS, -(-fine.windowed.reach // detail))
+        shape = fine.camera.rows // side, fine.camera.columns // side
+        if min(shape) < FEWEST_PARTS:
+            return None
+        weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
+        light = fine.forward(np.ones(fine.unknowns))
+        recorded = np.where(task.used, task.recorded, 0.0) - task.prior.mean * light
+
+        seen, sums = (
+            means_over(fine.adjoint(weights * each).reshape(fine.camera.shape), side) for each in (light, recorded)
+        )
+        if not (seen > 0).all():
+            return None
+        image, noise = sums / seen, max(float(np.mean(1 / seen)) / side**2, ROUNDING)
+        return cls(image, task.prior.level_deviation, noise, side, task.model.camera.target_pitch / detail)
+
+    def evidence(self, spectrum: Spectrum) -> Evidence:
+        """Return the evidence of a spectrum, whose means over parts are independent waves."""
+        return self._evidence(self.spectrum_of([spectrum.term]))
+
+    def spectrum_of(self, terms: Sequence[SpectralTerm]) -> FloatArray:
+        """Return the spectrum of means over parts, (rows, columns), of a few samples each: finer waves hardly count."""
+        count = min(self.side, SAMPLES)
+        shape = self.image.shape[0] * count, self.image.shape[1] * count
+        every = [natural_spectrum(shape, self.pitch * self.side / count, term) for term in terms]
+        return averaged_spectrum(np.sum(every, axis=0), count)
+
+    def excess(self, prior: FittedPrior) -> float:
+        """Return by how much the means vary more than images of a prior, in mean squares of waves; 1 is expected."""
+        squares = np.square(self.waves) / (self.spectrum_of(prior.terms) + self.noise)
+        return float(squares.ravel()[1:].mean())
+
+
+def means_over(image: FloatArray, side: int) -> FloatArray:
+    """Return means over side x side pixels, without what is left at the far ends: (rows, columns)."""
+    rows, columns = (size // side for size in image.shape)
+    kept = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
+    return np.asarray(kept.mean(axis=(1, 3)), dtype=np.float64)
 
 
 def _unknowns(task: EstimationTask) -> Model:
@@ -244,14 +313,14 @@ def _detail(task: EstimationTask) -> int:
     return _unknowns(task).camera.rows // task.shape[0]
 
 
-def _spectra(shape: tuple[int, int], pitch: float, detail: int) -> list[_Spectrum]:
+def _spectra(shape: tuple[int, int], pitch: float, detail: int) -> list[Spectrum]:
     """Return the spectra of natural pictures on a window's grid of this shape; pitch : of f."""
-    found: list[_Spectrum] = []
+    found: list[Spectrum] = []
     for exponent, length in _grid():
         term = SpectralTerm(1.0, exponent, length * pitch)
         values = natural_spectrum(shape, pitch / detail, term)
         term = term._replace(density=float(1 / values.mean()))
-        found.append(_Spectrum(values / values.mean(), term, 1 if exponent else len(LENGTHS)))
+        found.append(Spectrum(values / values.mean(), term, 1 if exponent else len(LENGTHS)))
     return found
 
 
@@ -260,11 +329,11 @@ def _grid() -> list[tuple[float, float]]:
     return [(0.0, LENGTHS[0]), *product(EXPONENTS, LENGTHS)]
 
 
-def _known(task: EstimationTask, shape: tuple[int, int]) -> _Spectrum:
+def _known(task: EstimationTask, shape: tuple[int, int]) -> Spectrum:
     """Return the prior of the task on a window's grid of this shape."""
     of_grid = task.model.camera.target_pitch / _detail(task)
     values = np.broadcast_to(np.asarray(spectrum_of(task.prior, shape, of_grid)), shape)
-    return _Spectrum(values, SpectralTerm(1.0, 0.0, of_grid), 1)
+    return Spectrum(values, SpectralTerm(1.0, 0.0, of_grid), 1)
 
 
 class ScalePosterior(NamedTuple):
@@ -345,7 +414,11 @@ def fit_prior(task: EstimationTask, *, prior_known: bool = False, noise_known: b
             " give prior.kind and estimator.noise_variance"
         )
     if noise_known:
-        return _fit(task, places, task.expected_noise, prior_known=prior_known, noise_known=True)
+        fit = _fit(task, places, task.expected_noise, prior_known=prior_known, noise_known=True)
+        overview = None if prior_known or len(places) == 1 else _PartMeans.of(task)
+        if overview is None or fit.prior is None or overview.excess(fit.prior) <= MOST_EXCESS:
+            return fit
+        return _fit(task, places, task.expected_noise, prior_known=False, noise_known=True, beside=[overview])
     # A multiple of the whole noise is fitted, whose distribution over the measurements is uniform at first.
     known = task.expected_noise
     fit = _fit(task, places, known + (UNIFORM * float(known.max()) or 1.0), prior_known=prior_known, noise_known=False)
@@ -369,8 +442,16 @@ def fit_picture(picture: FloatArray, detail: int, pitch: float, table: PriorTabl
     spectra = _spectra(windows[0].image.shape, pitch, detail)
     if not any(window.image.any() for window in windows):
         return None
-    posteriors, shares, _, _ = _posteriors(windows, spectra, prior_known=False, noise_known=True)
-    return _mean_prior(table, spectra, posteriors, shares)
+
+    def fitted(*beside: _PartMeans) -> FittedPrior:
+        posteriors, shares, _, _ = _posteriors([*windows, *beside], spectra, prior_known=False, noise_known=True)
+        return _mean_prior(table, spectra, posteriors, shares)
+
+    prior, side = fitted(), detail * max(min(picture.shape) // detail // PARTS, 1)
+    if len(windows) == 1 or min(picture.shape) < FEWEST_PARTS * side:
+        return prior
+    overview = _PartMeans(means_over(picture, side) - table.mean, table.level_deviation, ROUNDING, side, pitch / detail)
+    return prior if overview.excess(prior) <= MOST_EXCESS else fitted(overview)
 
 
 def natural_prior(table: PriorTable, pitch: float) -> FittedPrior:
@@ -382,10 +463,19 @@ def natural_prior(table: PriorTable, pitch: float) -> FittedPrior:
 
 
 def _fit(
-    task: EstimationTask, places: list[Place], noise: FloatArray, *, prior_known: bool, noise_known: bool
+    task: EstimationTask,
+    places: list[Place],
+    noise: FloatArray,
+    *,
+    prior_known: bool,
+    noise_known: bool,
+    beside: Sequence[_PartMeans] = (),
 ) -> PriorFit:
-    """Return the fit of the prior, and of a multiple of `noise`, (measurements used,)."""
-    windows = [place.window(task, noise) for place in places if place.numbers.size]
+    """Return the fit of the prior, and of a multiple of `noise`, (measurements used,).
+
+    beside : means over parts that count beside the windows
+    """
+    windows = [*(place.window(task, noise) for place in places if place.numbers.size), *beside]
     shape, pitch = places[0].shape, task.model.camera.target_pitch
     spectra = [_known(task, shape)] if prior_known else _spectra(shape, pitch, _detail(task))
     posteriors, shares, at_end, flat = _posteriors(windows, spectra, prior_known=prior_known, noise_known=noise_known)
@@ -406,13 +496,13 @@ def _fit(
 
 
 def _posteriors(
-    windows: Sequence[Window | _Picture], spectra: list[_Spectrum], *, prior_known: bool, noise_known: bool
+    windows: Sequence[Window | _Picture], spectra: list[Spectrum], *, prior_known: bool, noise_known: bool
 ) -> tuple[list[ScalePosterior], FloatArray, bool, bool]:
     """Return the posterior for every spectrum, and its share of the evidence.
 
     Then whether a number lies at the end of its range, and whether noise alone explains the measurements.
     """
-    every = [[window.evidence(spectrum.values) for window in windows] for spectrum in spectra]
+    every = [[window.evidence(spectrum) for window in windows] for spectrum in spectra]
     fixed, square = np.zeros(1), float(np.mean(np.concatenate([part.residual for part in every[0]]) ** 2))
     noises = fixed if noise_known else log(square) + np.arange(-2 * REACH, 3 * COARSE, COARSE)
     nothing = float(np.sum([part.log(fixed, np.exp(noises)) for part in every[0]], axis=0).max())
@@ -428,7 +518,7 @@ def _posteriors(
 
 
 def _mean_prior(
-    table: PriorTable, spectra: list[_Spectrum], posteriors: list[ScalePosterior], shares: FloatArray
+    table: PriorTable, spectra: list[Spectrum], posteriors: list[ScalePosterior], shares: FloatArray
 ) -> FittedPrior:
     """Return the prior whose spectrum is the mean of all, without those that hardly add to it."""
     variances = shares * [each.means[0] for each in posteriors]
@@ -442,7 +532,7 @@ def _mean_prior(
 
 
 def _numbers_of(
-    spectra: list[_Spectrum], posteriors: list[ScalePosterior], shares: FloatArray
+    spectra: list[Spectrum], posteriors: list[ScalePosterior], shares: FloatArray
 ) -> dict[str, tuple[float, float]]:
     """Return variance, exponent, and the correlation length of spectra that have one, with relative deviations.
 

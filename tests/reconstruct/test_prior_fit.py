@@ -10,11 +10,12 @@ from scipy import stats
 from skimage import data
 
 from ommatid.analysis.predict import predict_scene
+from ommatid.reconstruct import prior_fit
 from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.prior import FittedPrior, SpectralTerm, coloured, prior_of, spectrum_of
-from ommatid.reconstruct.prior_fit import PriorFit, fit_prior, places_of
+from ommatid.reconstruct.prior_fit import PriorFit, Spectrum, fit_picture, fit_prior, places_of
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -84,7 +85,9 @@ def test_the_evidence_is_the_density_of_the_measurements(count: int) -> None:
     used = np.arange(706) < count
     part = replace(whole, used=used, expected_noise=noise[used])
     (place,) = places_of(part)
-    evidence = place.window(part, part.expected_noise).evidence(np.asarray(spectrum_of(prior, SHAPE, PITCH)))
+    evidence = place.window(part, part.expected_noise).evidence(
+        Spectrum(np.asarray(spectrum_of(prior, SHAPE, PITCH)), prior.terms[0], 1)
+    )
     seen = part.model.matrix.toarray()[used] @ prior_of(prior, SHAPE, PITCH).root
     light = part.model.matrix.toarray()[used].sum(axis=1)
     constant = 0.5 * float(np.log(2 * np.pi * noise[used]).sum())
@@ -283,6 +286,41 @@ def test_detail_that_the_lens_averages_out_is_doubtful(contrast: float) -> None:
     result = restore(recorded(described, image, 1.0), model_of(SHAPE, lenses), image)
     doubts = " ".join(result.verdict.doubts)
     assert ("detail that no lens shows" in doubts) == (contrast > 0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "horizon", "seeds"), [((60, 47), 20, 1), pytest.param((119, 119), 71, 20, marks=pytest.mark.slow)]
+)
+def test_means_beside_a_horizon_that_no_window_shows(
+    shape: tuple[int, int], horizon: int, seeds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bright sky over dark ground: means clear of the edge err by what is stated, without an overview by tens."""
+    described = wide(shape, noise={"variance": 1.0}, prior={"kind": "fit"})
+    model, scores = ideal_model(described, derive(described)), dict[float, list[float]]()
+    for seed in range(seeds):
+        picture = np.where(np.arange(shape[0])[:, None] < horizon, 215.0, 50.0)
+        picture = picture + 3 * np.random.default_rng(seed).normal(size=shape)
+        stack = recorded(described, picture.ravel(), 1.0, seed)
+        for excess in (prior_fit.MOST_EXCESS, np.inf)[: 1 if seed else 2]:
+            with monkeypatch.context() as patch:
+                patch.setattr(prior_fit, "MOST_EXCESS", excess)
+                found = restore(stack, model)
+            for first, rows in ((0, horizon - 8), (horizon + 8, shape[0] - horizon - 8)):
+                mean, deviation = found.region((first, 0), (rows, shape[1]))
+                true = float(picture[first : first + rows].mean())
+                scores.setdefault(excess, []).append((mean - true) / deviation)
+    with_means, without = (float(np.sqrt(np.mean(np.square(each)))) for each in scores.values())
+    assert with_means < 2
+    assert without > 30
+
+
+def test_a_horizon_in_the_scenes_picture_is_part_of_its_prior() -> None:
+    picture = np.where(np.arange(60)[:, None] < 20, 215.0, 50.0) + np.random.default_rng(0).normal(0, 3, (60, 60))
+    table = PriorTable(kind="fit")
+    with_horizon, without = (fit_picture(each, 1, PITCH, table) for each in (picture, picture[20:]))
+    assert with_horizon is not None
+    assert without is not None
+    assert with_horizon.variance > 1000 > 20 > without.variance
 
 
 def test_error_bars_of_stars_are_doubtful() -> None:

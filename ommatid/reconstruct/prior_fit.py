@@ -85,7 +85,7 @@ class PriorFit:
     flat: bool = False
 
 
-class Spectrum(NamedTuple):
+class NaturalSpectrum(NamedTuple):
     """A spectrum on a window's grid, (rows, columns) of mean 1 unless it is known, its numbers, and a weight."""
 
     values: FloatArray
@@ -141,7 +141,7 @@ class Window:
         beside = float(left[0] @ left[0]), float(left[1] @ left[1]), float(left[0] @ left[1]), count
         return cls(np.asarray(kept, dtype=np.float64).reshape(-1, *shape), *turned, beside)
 
-    def evidence(self, spectrum: Spectrum) -> Evidence:
+    def evidence(self, spectrum: NaturalSpectrum) -> Evidence:
         """Return the evidence of images with a spectrum."""
         flat = self.waves.reshape(len(self.waves), -1)
         covariance = (flat * spectrum.values.ravel()) @ flat.T
@@ -195,7 +195,7 @@ class _Picture:
     level: float
     noise: float = ROUNDING
 
-    def evidence(self, spectrum: Spectrum) -> Evidence:
+    def evidence(self, spectrum: NaturalSpectrum) -> Evidence:
         """Return the evidence of a spectrum: the waves of the picture are independent."""
         return self._evidence(spectrum.values)
 
@@ -242,7 +242,7 @@ class _PartMeans(_Picture):
         image, noise = sums / seen, max(float(np.mean(1 / seen)) / side**2, ROUNDING)
         return cls(image, task.prior.level_deviation, noise, side, task.model.camera.target_pitch / detail)
 
-    def evidence(self, spectrum: Spectrum) -> Evidence:
+    def evidence(self, spectrum: NaturalSpectrum) -> Evidence:
         """Return the evidence of a spectrum, whose means over parts are independent waves."""
         return self._evidence(self.spectrum_of([spectrum.term]))
 
@@ -313,14 +313,14 @@ def _detail(task: EstimationTask) -> int:
     return _unknowns(task).camera.rows // task.shape[0]
 
 
-def _spectra(shape: tuple[int, int], pitch: float, detail: int) -> list[Spectrum]:
+def _spectra(shape: tuple[int, int], pitch: float, detail: int) -> list[NaturalSpectrum]:
     """Return the spectra of natural pictures on a window's grid of this shape; pitch : of f."""
-    found: list[Spectrum] = []
+    found: list[NaturalSpectrum] = []
     for exponent, length in _grid():
         term = SpectralTerm(1.0, exponent, length * pitch)
         values = natural_spectrum(shape, pitch / detail, term)
         term = term._replace(density=float(1 / values.mean()))
-        found.append(Spectrum(values / values.mean(), term, 1 if exponent else len(LENGTHS)))
+        found.append(NaturalSpectrum(values / values.mean(), term, 1 if exponent else len(LENGTHS)))
     return found
 
 
@@ -329,11 +329,11 @@ def _grid() -> list[tuple[float, float]]:
     return [(0.0, LENGTHS[0]), *product(EXPONENTS, LENGTHS)]
 
 
-def _known(task: EstimationTask, shape: tuple[int, int]) -> Spectrum:
+def _known(task: EstimationTask, shape: tuple[int, int]) -> NaturalSpectrum:
     """Return the prior of the task on a window's grid of this shape."""
     of_grid = task.model.camera.target_pitch / _detail(task)
     values = np.broadcast_to(np.asarray(spectrum_of(task.prior, shape, of_grid)), shape)
-    return Spectrum(values, SpectralTerm(1.0, 0.0, of_grid), 1)
+    return NaturalSpectrum(values, SpectralTerm(1.0, 0.0, of_grid), 1)
 
 
 class ScalePosterior(NamedTuple):
@@ -496,7 +496,7 @@ def _fit(
 
 
 def _posteriors(
-    windows: Sequence[Window | _Picture], spectra: list[Spectrum], *, prior_known: bool, noise_known: bool
+    windows: Sequence[Window | _Picture], spectra: list[NaturalSpectrum], *, prior_known: bool, noise_known: bool
 ) -> tuple[list[ScalePosterior], FloatArray, bool, bool]:
     """Return the posterior for every spectrum, and its share of the evidence.
 
@@ -518,7 +518,7 @@ def _posteriors(
 
 
 def _mean_prior(
-    table: PriorTable, spectra: list[Spectrum], posteriors: list[ScalePosterior], shares: FloatArray
+    table: PriorTable, spectra: list[NaturalSpectrum], posteriors: list[ScalePosterior], shares: FloatArray
 ) -> FittedPrior:
     """Return the prior whose spectrum is the mean of all, without those that hardly add to it."""
     variances = shares * [each.means[0] for each in posteriors]
@@ -532,7 +532,7 @@ def _mean_prior(
 
 
 def _numbers_of(
-    spectra: list[Spectrum], posteriors: list[ScalePosterior], shares: FloatArray
+    spectra: list[NaturalSpectrum], posteriors: list[ScalePosterior], shares: FloatArray
 ) -> dict[str, tuple[float, float]]:
     """Return variance, exponent, and the correlation length of spectra that have one, with relative deviations.
 

@@ -15,7 +15,7 @@ from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.reconstruct.prior import FittedPrior, SpectralTerm, coloured, prior_of, spectrum_of
-from ommatid.reconstruct.prior_fit import PriorFit, Spectrum, fit_picture, fit_prior, places_of
+from ommatid.reconstruct.prior_fit import NaturalSpectrum, PriorFit, fit_picture, fit_prior, places_of
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -86,7 +86,7 @@ def test_the_evidence_is_the_density_of_the_measurements(count: int) -> None:
     part = replace(whole, used=used, expected_noise=noise[used])
     (place,) = places_of(part)
     evidence = place.window(part, part.expected_noise).evidence(
-        Spectrum(np.asarray(spectrum_of(prior, SHAPE, PITCH)), prior.terms[0], 1)
+        NaturalSpectrum(np.asarray(spectrum_of(prior, SHAPE, PITCH)), prior.terms[0], 1)
     )
     seen = part.model.matrix.toarray()[used] @ prior_of(prior, SHAPE, PITCH).root
     light = part.model.matrix.toarray()[used].sum(axis=1)

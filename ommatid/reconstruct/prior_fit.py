@@ -12,12 +12,13 @@ with an unknown level of deviation L, the density
 t = 1 where the noise is known; Rv holds, too, what wide point spreads see beside the window, by one rank. The variance
 of a pixel, c, has before the stack the density that windows of natural pictures have. H P H^T, diagonalised once for
 each l and a, gives the evidence for every c and t; the windows count as independent (Stein, Chi and Welty 2004). All of
-them may lie in flat parts, bright and dark ones. Where means over parts of the image vary by far more than the fitted
-spectrum allows, they are measurements beside those of the windows. Few
-measurements and much noise leave the numbers open, above all how much the image holds at frequencies that no lens sees.
-So the prior is the mean of these spectra, weighted by their evidence: its covariance is that of images whose numbers
-are drawn from the posterior, and Eq. 5 holds on average over them. The exponents and lengths lie on a grid; c, and t
-where the noise is fitted, on one that is refined where the evidence is.
+them may lie in flat parts, bright and dark ones. Where the noise is known, and means over parts of the image vary by
+far more than the fitted spectrum allows, these are measurements beside those of the windows.
+
+Few measurements and much noise leave the numbers open, above all how much the image holds at frequencies that no lens
+sees. So the prior is the mean of these spectra, weighted by their evidence: its covariance is that of images whose
+numbers are drawn from the posterior, and Eq. 5 holds on average over them. The exponents and lengths lie on a grid; c,
+and t where the noise is fitted, on one that is refined where the evidence is.
 """
 
 from __future__ import annotations
@@ -233,7 +234,6 @@ class _PartMeans(_Picture):
         weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
         light = fine.forward(np.ones(fine.unknowns))
         recorded = np.where(task.used, task.recorded, 0.0) - task.prior.mean * light
-
         seen, sums = (
             means_over(fine.adjoint(weights * each).reshape(fine.camera.shape), side) for each in (light, recorded)
         )

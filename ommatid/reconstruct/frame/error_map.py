@@ -187,13 +187,13 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
         varies = varies_over_field(task.model.applied)
         for way in ways_to_edges(task, system.bands):
             maps = frame_map(task, system, system.bands, actual, way)
-            maps = by_windows(maps, task, task.model.applied, actual) if varies else maps
+            maps = by_windows(maps, task, task.model.applied, actual, kernels=True) if varies else maps
             yield _with_corners(maps, task, system, actual) if narrow else maps
         if not few or task.finer > 1 or not (varies or uneven):
             return
     elif task.finer > 1 and task.shape_of_f[0] * task.shape_of_f[1] > MANY:  # all windows would take an hour
         maps = frame_map(task, system, system.bands, actual, "edges")
-        yield by_windows(maps, task, task.model.applied, actual, system.bands)
+        yield by_windows(maps, task, task.model.applied, actual, kernels=False)
         return
     for halo in HALOS if few and not narrow else HALOS[:1]:
         yield windows_map(task, system.weights, system.bands, actual, halo)

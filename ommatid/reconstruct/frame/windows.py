@@ -325,19 +325,20 @@ def by_windows(
     task: EstimationTask,
     observation: Observation,
     actual: FloatArray,
-    bands: Bands | None = None,
+    *,
+    kernels: bool,
 ) -> VarianceMap:
     """Return the map of a camera from that of a shift-invariant one, `variances`.
 
-    Their ratios are those of some windows, and linear between these: where kernels vary over the field, of the same
-    readings imaged by the kernels or by their means, else of the readings of a window to the map itself. The mean is
-    right then, and single pixels as far as the cameras are alike.
+    Their ratios are those of some windows, and linear between these. The mean is right then, and single pixels as far
+    as the cameras are alike.
 
-    bands : of the shift-invariant camera, None where kernels vary
+    kernels : True compares kernels that vary over the field with their means, from the same readings of a window; False
+        a window with the map itself
     """
     shape, like = task.shape_of_f, None
     side, beside, most = min(SIDE, *shape), 0.0, WINDOWS
-    if bands is None:
+    if kernels:
         parts = [part.mean if isinstance(part, KernelFootprints) else part for part in observation.parts]
         like = Observation(observation.shape, tuple(parts))
     else:

@@ -57,20 +57,6 @@ def test_the_error_of_every_pixel_is_below_the_bound(
             assert solution.bound <= accuracy
 
 
-def test_from_a_start_near_the_solution_fewer_steps_are_left() -> None:
-    """As accurate as from none; a start that is accurate enough is the solution."""
-    system = ideal_system((39, 35), 1.0, FITTED)
-    right = np.random.default_rng(5).normal(size=system.observation.unknowns)
-    exact, cold = system.solve(right, 1e-8), system.solve(right, 0.01)
-    near = system.solve(0.99 * right, 0.01).image
-    warm, none = system.solve(right, 0.01, start=near.copy()), system.solve(right, 0.01, start=cold.image.copy())
-    assert (none.steps, none.bound) == (0, cold.bound)
-    assert warm.steps < cold.steps
-    assert warm.bound <= 0.01
-    deviation = system.prior**-0.5 if isinstance(system.prior, float) else 1.0
-    assert np.abs(warm.image - exact.image).max() <= 0.01 * deviation
-
-
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_bound_holds_for_uneven_h_and_noise(seed: int) -> None:
     """H with errors, noise over two decades and dead pixels take many steps, and the bound holds."""

@@ -14,6 +14,7 @@ from scipy import stats
 
 from ommatid.analysis.predict import predict_scene
 from ommatid.reconstruct.assumptions import assumptions_for
+from ommatid.reconstruct.frame.frame_method import FrameMethod
 from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import Execution, Prepared
 from ommatid.reconstruct.prior import coloured, reflecting_root, spectrum_of
@@ -119,6 +120,25 @@ def test_it_is_the_dense_estimate_with_the_same_error_bars(case: str, shape: tup
     assert abs(frame.interval.mse - dense.interval.mse) < width
     assert 0.7 * width < frame.interval.high - frame.interval.low < 1.6 * width
     assert frame.region((8, 9), (6, 20)) == pytest.approx(dense.region((8, 9), (6, 20)), rel=1e-4)
+
+
+def test_from_a_solution_for_nearly_the_same_noise_fewer_steps_are_left() -> None:
+    """As accurate as from none: the image, its level, and what the estimate lacks of a constant image."""
+    scene = wide(SHAPE, noise={"variance": 1.0}, prior={"kind": "exponential", "correlation_length": "8 mm"})
+    stack, model = recorded(scene, drawn(SHAPE, 2), 1.0), ideal_model(scene, derive(scene))
+    choice = choose_method(scene, stack.camera, exact=True)
+    assert choice.method == "frame"
+    task = assumptions_for(stack, model, choice, Execution()).method.task
+    noisier = replace(task, expected_noise=1.02 * task.expected_noise)
+    near, cold = FrameMethod(task, Execution()), FrameMethod(noisier, Execution())
+    warm = FrameMethod(noisier, Execution(nearby=near.nearby))
+    assert warm.solution.steps < cold.solution.steps
+    assert max(warm.solution.bound, cold.solution.bound) <= task.settings.accuracy
+    assert np.abs(warm.image - cold.image).max() < 0.02
+    assert warm.response is not None
+    assert cold.response is not None
+    np.testing.assert_allclose(warm.response, cold.response, atol=1e-3)
+    assert np.abs(near.image - cold.image).max() > 0.03, "another solution"
 
 
 @pytest.mark.slow

@@ -168,21 +168,13 @@ class FrameSystem:
         """Mean weight of each lens type."""
         return tuple(float(self.weights[part].mean()) for part in self._types)
 
-    def solve(
-        self,
-        right: FloatArray,
-        accuracy: float = ACCURACY,
-        progress: Progress = no_progress,
-        start: FloatArray | None = None,
-    ) -> Solution:
+    def solve(self, right: FloatArray, accuracy: float = ACCURACY, progress: Progress = no_progress) -> Solution:
         """Return C b with an error of at most `accuracy` posterior standard deviations in every pixel.
 
-        start : about C b, (N,), from which fewer steps are left
         Raises NotReachedError if the iteration does not get there.
         """
         with one_thread():  # dot products gain nothing from threads and wait for them
-            image, lanczos = np.zeros_like(right) if start is None else start, _Lanczos()
-            residual = right.copy() if start is None else right - self.apply(start)
+            image, residual, lanczos = np.zeros_like(right), right.copy(), _Lanczos()
             for _ in range(MAX_STARTS):
                 image, lanczos = self._iterated(image, residual, accuracy, lanczos, progress)
                 residual = right - self.apply(image)  # the recursive residual excludes rounding errors
@@ -355,18 +347,11 @@ class BandedSystem(FrameSystem):
     def _factor(self) -> FloatArray:
         return banded_cholesky(self.precision, self._order)
 
-    def solve(
-        self,
-        right: FloatArray,
-        accuracy: float = ACCURACY,
-        progress: Progress = no_progress,
-        start: FloatArray | None = None,
-    ) -> Solution:
+    def solve(self, right: FloatArray, accuracy: float = ACCURACY, progress: Progress = no_progress) -> Solution:
         """Return C b with an error of at most `accuracy` posterior standard deviations in every pixel.
 
         Raises NotReachedError if rounding prevents it.
         """
-        del start  # one step does without
         image, residual, bound, steps = np.zeros_like(right), right, np.inf, 0
         while steps <= MAX_REFINEMENTS and not bound <= accuracy:
             change = np.empty_like(right)

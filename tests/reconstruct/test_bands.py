@@ -196,6 +196,8 @@ def test_a_window_turns_the_map_of_mean_kernels_into_that_of_all(monkeypatch: py
         among_used=lambda numbers: numbers,
         expected_noise=noise,
     )
-    found = windows.by_windows(VarianceMap(maps[1], maps[1], maps[1]), task, varying, noise, kernels=True)
+    found = windows.by_windows(
+        VarianceMap(maps[1], maps[1], maps[1]), task, varying, noise, windows.of_mean_kernels(varying)
+    )
     assert found.posterior.mean() == pytest.approx(maps[0].mean(), rel=1e-6)
     assert abs(maps[0].mean() / maps[1].mean() - 1) > 0.05

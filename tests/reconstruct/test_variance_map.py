@@ -14,7 +14,7 @@ from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
 from ommatid.reconstruct.frame.error_map import ExactVariances, check_map, error_map
 from ommatid.reconstruct.frame.swept import swept_maps
 from ommatid.reconstruct.frame.variance_map import frame_map
-from ommatid.reconstruct.frame.windows import Windows, by_windows, windows_map
+from ommatid.reconstruct.frame.windows import Windows, by_windows, of_mean_kernels, windows_map
 from ommatid.reconstruct.methods.method import EstimationTask
 from ommatid.reconstruct.prior import reflecting_root
 from ommatid.runtime.arrays import FloatArray
@@ -187,7 +187,7 @@ def test_kernels_that_vary_over_the_field() -> None:
     system = replace(system_of(task), observation=observation)
     assert system.bands is not None
     maps = frame_map(task, system, system.bands, task.expected_noise, "edges")
-    variance = by_windows(maps, task, observation, task.expected_noise, kernels=True).posterior
+    variance = by_windows(maps, task, observation, task.expected_noise, of_mean_kernels(observation)).posterior
     for place in ((0, 0), (41, 44), (41, 0), (82, 30), (20, 60), (60, 89), (5, 70), (70, 12)):
         unit = np.zeros(shape)
         unit[place] = 1.0
@@ -202,7 +202,7 @@ def test_some_windows_give_the_mean_error_of_another_camera() -> None:
     system = system_of(task)
     assert system.bands is not None
     like = frame_map(task, system, system.bands, task.expected_noise, "edges")
-    found = by_windows(like, task, task.model.applied, task.expected_noise, kernels=False)
+    found = by_windows(like, task, task.model.applied, task.expected_noise)
     every = windows_map(task, system.weights, system.bands, task.expected_noise, 8)
     assert found.variance.mean() == pytest.approx(every.variance.mean(), rel=0.02)
     assert like.variance.mean() < 0.93 * every.variance.mean()

@@ -30,7 +30,7 @@ def pupil(waves: Aberration, slope: float, reach: float = GRID_REACH) -> Wavefro
     slope : the largest change of the aberration over the radius, waves per radius
     """
     spot = 2 * slope * UNIT
-    radius, angle, area = polar_nodes(node_counts(2 * np.pi * HALF / WAVELENGTH * (2 * spot + reach * UNIT)))
+    radius, angle, area = polar_nodes(node_counts(HALF / WAVELENGTH, spot, spot + reach * UNIT))
     turn = np.ones_like(radius) * angle
     share = (np.ones_like(turn) * area).ravel()
     unit = (radius * np.stack([np.cos(angle), np.sin(angle)])).reshape(2, -1)

@@ -12,7 +12,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.ray_transport import responses_from_rays
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.lenses.field import TOLERANCE, field_of
-from ommatid.simulate.lenses.point_spread import density
+from ommatid.simulate.lenses.point_spread import density, grid_of, point_spread
 
 from ..examples import familywise, needs
 from .test_lenses import built
@@ -132,3 +132,19 @@ def test_rows_add_up_to_the_light_that_the_target_sends() -> None:
     assert rays.max() == pytest.approx(1, abs=1e-9)
     assert (waves < 0.996).all()
     assert (waves > 0.5).all()
+
+
+def test_waves_on_a_grid_wider_than_their_own() -> None:
+    """As for the middle of a field whose corner is blurred: the same light within its own, and never more than all."""
+    setup = setup_of(FLAT, "550 nm")
+    lens = field_of(setup.camera, setup.camera.types[0], setup.camera.wavelength)
+    near = lens.wave(0.0, lens.wavelength)
+    assert near is not None
+    cell, half = grid_of(near)
+    far = lens.wave(0.0, lens.wavelength, 2 * half)
+    assert far is not None
+    expected, found = point_spread(near), point_spread(far, (cell, 2 * half))
+    edge = (len(found.values) - len(expected.values)) // 2
+    middle = found.values[edge:-edge, edge:-edge]
+    np.testing.assert_allclose(middle, expected.values, atol=1e-6 * expected.values.max())
+    assert expected.inside < found.inside < 1

@@ -27,7 +27,7 @@ from .conjugate_gradients import BandedSystem, FrameSystem, NotReachedError, lea
 from .reading_space import ReadingSpace
 from .swept import swept_maps
 from .variance_map import VarianceMap, frame_map, is_narrow, is_uneven, unseen_corners, ways_to_edges
-from .windows import HALOS, Windows, by_windows, varies_over_field, windows_map
+from .windows import HALOS, Windows, by_windows, of_mean_kernels, varies_over_field, windows_map
 
 Pixels = NDArray[np.intp]
 
@@ -182,18 +182,19 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
     if system.bands is None:
         raise TypeError("expected a system with a preconditioner")
     few, narrow = task.model.unknowns <= MANY, is_narrow(task)
-    uneven = is_uneven(task, system)
-    if is_invariant(task) and not (narrow and uneven):
-        varies = varies_over_field(task.model.applied)
+    uneven, applied = is_uneven(task, system), task.model.applied
+    varies = varies_over_field(applied)
+    all_windows = few and task.finer == 1
+    if is_invariant(task) and not (narrow and uneven) and not (varies and all_windows):
         for way in ways_to_edges(task, system.bands):
             maps = frame_map(task, system, system.bands, actual, way)
-            maps = by_windows(maps, task, task.model.applied, actual, kernels=True) if varies else maps
+            maps = by_windows(maps, task, applied, actual, of_mean_kernels(applied)) if varies else maps
             yield _with_corners(maps, task, system, actual) if narrow else maps
-        if not few or task.finer > 1 or not (varies or uneven):
+        if not (all_windows and uneven):
             return
     elif task.finer > 1 and task.shape_of_f[0] * task.shape_of_f[1] > MANY:  # all windows would take an hour
         maps = frame_map(task, system, system.bands, actual, "edges")
-        yield by_windows(maps, task, task.model.applied, actual, kernels=False)
+        yield by_windows(maps, task, applied, actual)
         return
     for halo in HALOS if few and not narrow else HALOS[:1]:
         yield windows_map(task, system.weights, system.bands, actual, halo)

@@ -42,8 +42,9 @@ CORE = 12  # pixels of f along a side of the core whose variances a window gives
 HALOS = 8, 12, 16  # pixels of f around it, of which a longer one takes several times as long
 MOST_ENTRIES = 30_000_000  # of H of a part, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
-SIDE, WINDOWS = 28, 3  # pixels of f of a window that shows what the variation of kernels does; windows along each axis
-MORE_WINDOWS = 6  # the same where a camera is compared with a shift-invariant one
+SIDE, FINE_SIDE = 28, 20  # pixels of f of a window that compares a camera with a map; with a camera, and a finer world
+RIM = 0.3  # of such a window that lies beside its core, on either side
+FEWEST, MOST = 3, 8  # such windows along an axis
 Core = tuple[slice, ...]
 WHOLE = slice(None), slice(None)
 REPEATS = 5  # windows with the same footprints, from which one and how the others differ are faster than all
@@ -320,57 +321,55 @@ def varies_over_field(observation: Observation) -> bool:
     return any(isinstance(part, KernelFootprints) and part.variation > VARYING for part in observation.parts)
 
 
+def of_mean_kernels(observation: Observation) -> Observation:
+    """Return the camera whose kernels are everywhere their means over the field."""
+    parts = (part.mean if isinstance(part, KernelFootprints) else part for part in observation.parts)
+    return Observation(observation.shape, tuple(parts))
+
+
 def by_windows(
     variances: VarianceMap,
     task: EstimationTask,
     observation: Observation,
     actual: FloatArray,
-    *,
-    kernels: bool,
+    like: Observation | None = None,
 ) -> VarianceMap:
-    """Return the map of a camera from that of a shift-invariant one, `variances`.
+    """Return the map of a camera, `observation`, from that of a similar shift-invariant one, `variances`.
 
     Their ratios are those of some windows, and linear between these. The mean is right then, and single pixels as far
     as the cameras are alike.
 
-    kernels : True compares kernels that vary over the field with their means, from the same readings of a window; False
-        a window with the map itself
+    like : the similar camera, which windows compare from the same readings, so that their halos may be short; None:
+        windows are compared with the map itself
     """
-    shape, like = task.shape_of_f, None
-    side, beside, most = min(SIDE, *shape), 0.0, WINDOWS
-    if kernels:
-        parts = [part.mean if isinstance(part, KernelFootprints) else part for part in observation.parts]
-        like = Observation(observation.shape, tuple(parts))
-    else:
-        beside, most = float(variances.posterior.mean()), MORE_WINDOWS
-    starts = [np.unique(np.linspace(0, size - side, most).round().astype(int)) for size in shape]
-    windows = Windows(task, actual, (side, side), beside=beside)
+    shape, side = task.shape_of_f, min(FINE_SIDE if like and task.finer > 1 else SIDE, *task.shape_of_f)
+    rim = round(RIM * side)
+    windows = Windows(task, actual, (side, side), beside=0.0 if like else float(variances.posterior.mean()))
+    axes: list[list[Stretch]] = []
+    for size in shape:
+        count = max(FEWEST, min(size // side, MOST))
+        firsts = np.unique(np.linspace(0, size - side, count).round().astype(int)).tolist()
+        ends = [(rim if first else 0, side - rim if first + side < size else side) for first in firsts]
+        axes.append([Stretch(first, slice(*each)) for first, each in zip(firsts, ends, strict=True)])
 
-    def ratio(corner: tuple[int, int]) -> FloatArray:
-        core = tuple(
-            slice(0 if first == 0 else HALOS[0], side if first + side == size else side - HALOS[0])
-            for first, size in zip(corner, shape, strict=True)
-        )
-        found = windows.map(observation, corner, core).mean(axis=(1, 2))
-        if like is None:
-            place = tuple(
-                slice(first + part.start, first + part.stop) for first, part in zip(corner, core, strict=True)
-            )
-            maps = variances.posterior, variances.missing, variances.noisy
-            other = np.array([each[place].mean() for each in maps])
+    def ratio(place: tuple[Stretch, Stretch]) -> FloatArray:
+        corner, core = (place[0].first, place[1].first), (place[0].core, place[1].core)
+        if like:
+            others = windows.map(like, corner, core)
         else:
-            other = windows.map(like, corner, core).mean(axis=(1, 2))
+            rows, columns = (slice(each.first + each.core.start, each.first + each.core.stop) for each in place)
+            others = np.array([variances.posterior, variances.missing, variances.noisy])[:, rows, columns]
+        found, other = (maps.mean(axis=(1, 2)) for maps in (windows.map(observation, corner, core), others))
         return np.divide(found, other, out=np.ones(3), where=other > 0)
 
     with one_thread(), ThreadPoolExecutor(processors()) as threads:
-        corners = product(*(each.tolist() for each in starts))
-        ratios = np.array(list(threads.map(ratio, corners))).T.reshape(3, starts[0].size, starts[1].size)
-    middles = [each + side / 2 for each in starts]
-    down, across = (_interpolation(size, middle) for size, middle in zip(shape, middles, strict=True))
+        ratios = np.array(list(threads.map(ratio, product(*axes)))).T.reshape(3, len(axes[0]), len(axes[1]))
+    down, across = (_interpolation(size, axis) for size, axis in zip(shape, axes, strict=True))
     whole = [down @ each @ across.T for each in ratios]
     return VarianceMap(variances.posterior * whole[0], variances.missing * whole[1], variances.noisy * whole[2])
 
 
-def _interpolation(size: int, nodes: FloatArray) -> FloatArray:
-    """Return the matrix from values at nodes of an axis to its pixels, constant beyond the nodes: (size, nodes)."""
-    return np.stack([np.interp(np.arange(size) + 0.5, nodes, unit) for unit in np.eye(nodes.size)], axis=1)
+def _interpolation(size: int, axis: list[Stretch]) -> FloatArray:
+    """Return the matrix from values of cores along an axis to its pixels, linear, constant beyond: (size, cores)."""
+    middles = [each.first + (each.core.start + each.core.stop) / 2 for each in axis]
+    return np.stack([np.interp(np.arange(size) + 0.5, middles, unit) for unit in np.eye(len(middles))], axis=1)

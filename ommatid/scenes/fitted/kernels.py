@@ -31,7 +31,6 @@ from ..lens_type import LensType
 from ..observation import Back, ComplexArray, ObservationPart, Seen, padded_shape
 from .kernel_shapes import KernelShapes, Numbers
 
-VALUES_AT_ONCE = 2**24  # of kernels that are made for a part of the pixels
 ENTRY = 24  # bytes of an entry of a matrix while it is made
 MOST_DEGREE = 50  # of polynomials in a file
 
@@ -362,34 +361,42 @@ class KernelFootprints(ObservationPart):
     def rows(self, pixels: IntArray, window: tuple[slice, slice] | None = None) -> sparse.csr_array:
         """Return H of some pixels of the lens type on a window of f, the whole of it by default: (n, its pixels)."""
         tall, wide = window or (slice(0, self.shape[0]), slice(0, self.shape[1]))
-        width = wide.stop - wide.start
-        down, across = self.places.cells(pixels)
-        values = self.values(pixels)
-        inside = ((down >= tall.start) & (down < tall.stop))[:, :, None]
-        inside = inside & ((across >= wide.start) & (across < wide.stop))[:, None] & (values != 0)
-        texels = (down - tall.start)[:, :, None] * width + (across - wide.start)[:, None]
-        pointers = np.concatenate([[0], np.cumsum(inside.sum(axis=(1, 2)))])
+        size, width = self.places.width, wide.stop - wide.start
+        lines, beside = self.places.lines(pixels)
+        lefts, shares = self.places.starts[1][beside], self._shares(pixels)
+        order = np.argsort(lines, kind="stable")
+        found: list[tuple[FloatArray, IntArray, IntArray]] = []
+        for part in np.split(order, np.flatnonzero(np.diff(lines[order])) + 1) if pixels.size else []:
+            top, left = int(self.places.starts[0][lines[part[0]]]), lefts[part]  # kernels are cut off alike along a row
+            down, across = (
+                np.arange(max(first, 0), min(last, size))
+                for first, last in (
+                    (tall.start - top, tall.stop - top),
+                    (wide.start - int(left.max()), wide.stop - int(left.min())),
+                )
+            )
+            values = np.tensordot(shares[part], self.shapes.kernels[:, down][:, :, across], axes=1)
+            columns = left[:, None] + across - wide.start
+            texels = ((down + top - tall.start) * width)[:, None] + columns[:, None]
+            inside = ((columns >= 0) & (columns < width))[:, None] & (values != 0)
+            found.append((values[inside], texels[inside], inside.sum(axis=(1, 2))))
+        nothing = np.zeros(0), np.zeros(0, dtype=np.intp), np.zeros(1, dtype=np.intp)
+        values, texels, counts = (np.concatenate(each) for each in zip(nothing, *found, strict=True))
         shape = pixels.size, (tall.stop - tall.start) * width
-        return sparse.csr_array((values[inside], texels[inside], pointers), shape=shape)
+        return sparse.csr_array((values, texels, np.cumsum(counts)), shape=shape)[np.argsort(order)]
 
     def values(self, pixels: IntArray) -> FloatArray:
         """Return the kernels of some pixels of the lens type, beside the target as well: (n, W, W)."""
-        return self._kernels_at(self.places.positions(pixels))
+        return np.tensordot(self._shares(pixels), self.shapes.kernels, axes=1)
 
-    def _kernels_at(self, positions: FloatArray) -> FloatArray:
-        """Return the kernels at positions (u, v), (n, 2): (n, W, W)."""
-        shares = basis(positions, self.degree) @ self.coefficients.T
-        return np.tensordot(shares, self.shapes.kernels, axes=1)
-
-    def _chunked(self, pixels: IntArray, window: tuple[slice, slice] | None = None) -> sparse.csr_array:
-        count = max(1, VALUES_AT_ONCE // self.places.width**2)
-        chunks = (pixels[first : first + count] for first in range(0, max(pixels.size, 1), count))
-        return sparse.csr_array(sparse.vstack([self.rows(chunk, window) for chunk in chunks], format="csr"))
+    def _shares(self, pixels: IntArray) -> FloatArray:
+        """Return the weight of each kernel in some pixels of the lens type: (n, S)."""
+        return basis(self.places.positions(pixels), self.degree) @ self.coefficients.T
 
     def to_sparse(self) -> sparse.csr_array:
         """Return H as a sparse matrix, (measurements of the type, N). Raises InputError if memory does not hold it."""
         check_memory(ENTRY * self.entries, "H with its entries", "crop the target")
-        return self._chunked(np.arange(self.measurements))
+        return self.rows(np.arange(self.measurements))
 
     def coarser(self, camera: Camera, detail: int) -> KernelFootprints:
         """Return H of images of `detail` times larger pixels; camera : on their grid."""
@@ -416,7 +423,7 @@ class KernelFootprints(ObservationPart):
 
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to the measurements inside it."""
-        return self._chunked(self.measurements_inside(rows, columns), (rows, columns))
+        return self.rows(self.measurements_inside(rows, columns), (rows, columns))
 
     def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to some measurements; what they see beside it is left out."""

@@ -16,7 +16,7 @@ from scipy import sparse
 from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.machine import check_memory
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes, ring_masks
-from ommatid.scenes.fitted.kernels import VALUES_AT_ONCE, KernelFootprints, KernelPlaces
+from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces
 
 from ..calibration.point_sources import Responses
 
@@ -25,6 +25,7 @@ LEAST_SCATTER = 1e-3  # of independent rays' variance: the least that a weight a
 CORE = 0.01  # of the largest light in a cell: cells with more are learnt one by one,
 LEAST_INSIDE = 0.5  # of a ring's light that is on the target, from which a pixel tells of it
 MOST_CORE = 48  # pixels of f along an axis: in a core of at most so many
+VALUES_AT_ONCE = 2**24  # of kernels that are made for a part of the pixels
 LEVEL = 3.0  # mean squared over variance of a picture whose values are uniform between 0 and 255
 CORRELATED = 3.0  # pixels of f over which a picture's correlation falls to 1/e
 
@@ -167,7 +168,7 @@ def _expected(designed: KernelFootprints, core: int, pixels: IntArray) -> tuple[
     wide, mean, masks = places.width, designed.shapes.designed[0], ring_masks(places.width, core)
     middle = slice((wide - core) // 2, (wide + core) // 2)
     expected, shares = list[FloatArray](), list[FloatArray]()
-    step = max(1, VALUES_AT_ONCE // wide**2)
+    step = 1 + VALUES_AT_ONCE // (wide * wide)
     for part in (pixels[first : first + step] for first in range(0, pixels.size, step)):
         down, across = ((cells >= 0) & (cells < size) for cells, size in zip(places.cells(part), shape, strict=True))
         inside = down[:, :, None] & across[:, None]

@@ -23,7 +23,7 @@ from ommatid.scenes.lens_type import LensType
 from .point_spread import grid_of, point_spread
 from .prescription import Prescription, prescribe, prescription_of
 from .ray_trace import Disk, exit_disk, reach
-from .wavefront import GRID_REACH, Wavefront, wavefront_of
+from .wavefront import Wavefront, wavefront_of
 
 HEIGHTS = 17  # at which the middle and the amount of the light are traced, splines between
 TOLERANCE = 1e-3  # of a point-spread function: the sum of the absolute errors of its cells
@@ -49,9 +49,12 @@ class LensField:
     field: float
     wavelength: float | None
 
-    def wave(self, height: float, wavelength: float | None) -> Wavefront | None:
-        """Return the wave of a sensor point (0, height), or None if it gets no light."""
-        return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, GRID_REACH)
+    def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
+        """Return the wave of a sensor point (0, height), or None if it gets no light.
+
+        half : of the width of the grid that the wave's nodes serve, where it is wider than that of its own
+        """
+        return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, half)
 
     @cached_property
     def _rays(self) -> tuple[FloatArray, list[Wavefront]]:
@@ -122,13 +125,12 @@ class LensField:
             return self._rays
         last = float(self._rays[0][-1])
         known = {height: self.lit_wave(height) for height in (0.0, last)}
-        grid = self._common_grid(list(known.values()))
 
         def interval(low: float, high: float) -> tuple[float, float, float]:
             """Return the error of interpolation in the middle of an interval, and its ends."""
             middle = (low + high) / 2
             known[middle] = self.lit_wave(middle)
-            ends = [point_spread(known[height], grid).values for height in (low, middle, high)]
+            ends = [point_spread(known[height], self.grid).values for height in (low, middle, high)]
             return float(np.abs(ends[1] - (ends[0] + ends[2]) / 2).sum()), low, high
 
         heights, intervals = [0.0, last], [interval(0.0, last)]
@@ -141,24 +143,20 @@ class LensField:
         heights.sort()
         return np.array(heights), [known[height] for height in heights]
 
-    def lit_wave(self, height: float) -> Wavefront:
-        """Return the wave of a sensor point that gets light."""
-        wave = self.wave(height, self.wavelength)
-        if wave is None:
-            raise ValueError(f"no light at a height of {height:g} mm, expected a lit one")
-        return wave
+    def lit_wave(self, height: float, half: float | None = None) -> Wavefront:
+        """Return the wave of a sensor point that gets light, at nodes that serve a grid, by default `grid`."""
+        return _lit(self.wave(height, self.wavelength, self.grid[1] if half is None else half), height)
 
-    @staticmethod
-    def _common_grid(waves: list[Wavefront]) -> tuple[float, float]:
-        """Return a grid that is fine and wide enough for all waves but those of slivers of the pupil."""
-        grids = [grid_of(wave) for wave in waves]
-        cell, widest = min(cell for cell, _ in grids), min(half for _, half in grids) * MOST_WIDER
-        return cell, min(max(half for _, half in grids), widest)
+    def outline(self, height: float) -> Wavefront:
+        """Return the rays alone of a sensor point that gets light, whose grid is that of its wave."""
+        return replace(_lit(self.wave(height, None), height), wavelength=self.wavelength)
 
     @cached_property
     def grid(self) -> tuple[float, float]:
-        """The grid of all point-spread functions of this lens."""
-        return self._common_grid(self.nodes[1])
+        """The grid of all point-spread functions of this lens: for all waves but those of slivers of the pupil."""
+        grids = [grid_of(replace(rays, wavelength=self.wavelength)) for rays in self._rays[1]]
+        cell, widest = min(cell for cell, _ in grids), min(half for _, half in grids) * MOST_WIDER
+        return cell, min(max(half for _, half in grids), widest)
 
     @cached_property
     def steps(self) -> tuple[int, int]:
@@ -198,6 +196,12 @@ class LensField:
         return spread
 
 
+def _lit(wave: Wavefront | None, height: float) -> Wavefront:
+    if wave is None:
+        raise ValueError(f"no light at a height of {height:g} mm, expected a lit one")
+    return wave
+
+
 @dataclass(frozen=True, eq=False)
 class SamplingTables:
     """Densities of the slopes by which diffraction and aberrations turn rays from the mean one.
@@ -222,20 +226,19 @@ def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: 
     cells : of the grid per wavelength times f-number;  reach : of the grid beyond the spot, in the same unit
     """
     heights, vergences = field.nodes[0], np.where(np.abs(vergences) < LEAST_VERGENCE, LEAST_VERGENCE, vergences)
-    waves = [[replace(field, distance=1 / v).lit_wave(float(height)) for v in vergences] for height in heights]
-    all_waves = [(wave, abs(v)) for row in waves for wave, v in zip(row, vergences, strict=True)]
-    cell = min(wave.resolution * v for wave, v in all_waves) / cells
-    half = max((wave.spot_radius + reach * wave.resolution) * v for wave, v in all_waves)
+    cases = [(replace(field, distance=1 / v), float(height), abs(v)) for height in heights for v in vergences]
+    slopes = [(each.resolution * v, each.spot_radius * v) for each, v in ((at.outline(h), v) for at, h, v in cases)]
+    cell = min(fine for fine, _ in slopes) / cells
+    half = max(spot + reach * fine for fine, spot in slopes)
     tables: list[FloatArray] = []
     captured: list[float] = []
-    for row in waves:
-        for wave, v in zip(row, vergences, strict=True):
-            spread = point_spread(wave, (cell / abs(v), half / abs(v)))
-            values = spread.values if v > 0 else spread.values[::-1, ::-1]
-            damping = np.maximum(np.sinc(np.fft.fftfreq(len(values))) ** 2, np.sinc(1 / cells) ** 2)
-            sharpened = np.fft.ifft2(np.fft.fft2(values) / np.outer(damping, damping)).real
-            tables.append(np.maximum(sharpened, 0.0) / spread.inside)
-            captured.append(spread.inside)
+    for at, height, v in cases:
+        spread = point_spread(at.lit_wave(height, half / v), (cell / v, half / v))
+        values = spread.values if at.distance > 0 else spread.values[::-1, ::-1]
+        damping = np.maximum(np.sinc(np.fft.fftfreq(len(values))) ** 2, np.sinc(1 / cells) ** 2)
+        sharpened = np.fft.ifft2(np.fft.fft2(values) / np.outer(damping, damping)).real
+        tables.append(np.maximum(sharpened, 0.0) / spread.inside)
+        captured.append(spread.inside)
     shape = (heights.size, vergences.size, *tables[0].shape)
     densities = np.stack(tables).reshape(shape).astype(np.float64)
     return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)))

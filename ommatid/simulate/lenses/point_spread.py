@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
-from .wavefront import GRID_REACH, Wavefront
+from .wavefront import Wavefront
 
 PRECISION = 1e-9  # of U, relative to its largest value
 CELLS = 4  # per wavelength times f-number; 2 would be enough for the frequencies of |U|^2
-LEAST_INSIDE = 0.995
-WIDER = 1.25
 MOST_CELLS = 4096
 
 
@@ -81,29 +79,24 @@ def grid_of(wave: Wavefront, cells: int = CELLS) -> tuple[float, float]:
 
     cells : per wavelength times f-number
     """
-    return wave.resolution / cells, wave.spot_radius + GRID_REACH * wave.resolution
+    return wave.resolution / cells, wave.extent
 
 
 def point_spread(wave: Wavefront, grid: tuple[float, float] | None = None) -> PointSpread:
     """Return the point-spread function on a grid, cut off beyond.
 
-    grid : from `grid_of`, of this wave or of a wider one; None: its own, and wider until it holds 99.5 per cent of the
-        light
-    The wave's nodes must serve the whole grid, as those of `wavefront_of` with a `reach` of GRID_REACH do.
+    grid : from `grid_of`, of this wave or of a wider one; None: its own
+    The wave's nodes must serve the whole grid: beyond the `half` of `wavefront_of`, light appears that is not there.
     Raises InputError for a grid of more than MOST_CELLS cells along an axis.
     """
     cell, half = grid or grid_of(wave)
-    while True:
-        count = 2 * ceil(half / cell) + 1
-        if count > MOST_CELLS:
-            raise InputError(
-                f"the point-spread function is {2 * wave.spot_radius / wave.resolution:.3g} times as wide as its finest"
-                ' detail, more than can be computed; use camera.wavelength = "none", as diffraction is negligible'
-            )
-        spread = PointSpread(_on_grid(wave, cell, count), cell)
-        if spread.inside >= LEAST_INSIDE or grid is not None:
-            return spread
-        half *= WIDER
+    count = 2 * ceil(half / cell) + 1
+    if count > MOST_CELLS:
+        raise InputError(
+            f"the point-spread function is {2 * wave.spot_radius / wave.resolution:.3g} times as wide as its finest"
+            ' detail, more than can be computed; use camera.wavelength = "none", as diffraction is negligible'
+        )
+    return PointSpread(_on_grid(wave, cell, count), cell)
 
 
 def _on_grid(wave: Wavefront, cell: float, count: int) -> FloatArray:

@@ -27,8 +27,9 @@ from .field import LensField, bands, check_waves, field_of
 from .point_spread import point_spread
 from .surface_matrix import overlaps
 
-CHARTS = {3: (2, 4), 5: (6, 8), 9: (10, 12, 14, 16)}  # nodes along a side of a quadrant, and degrees for them
+CHARTS = {3: (2, 4), 5: (6,), 7: (8, 10), 12: (12, 14, 16)}  # nodes along a side of a quadrant, degrees for them
 HIGHEST = 16
+BETWEEN = 4  # nodes along a side, those of no chart, at which the polynomials are tried
 TOLERANCE = 1e-3  # error of an entry, relative to the largest of its row, with which a degree is enough,
 MOST = 3e-3  # and with which the highest is: where light begins to be cut off by a rim, polynomials serve less
 SHARE = 0.5  # of it that leaving out components may take
@@ -76,12 +77,21 @@ class _FieldRows:
         down, across = (overlaps(each, -offsets, wide, cell) for each in edges)
         return np.asarray(down.T @ spread.values @ across, dtype=np.float64)
 
-    def quadrant(self, down: FloatArray, across: FloatArray) -> FloatArray:
-        """Return the rows at all pairs of u and v, both 0 or more: (pairs, W, W)."""
+    def chart(self, nodes: FloatArray, *, ends: bool) -> tuple[FloatArray, FloatArray]:
+        """Return pairs of u and v in a quadrant, (pairs, 2), and the rows there, (pairs, W^2).
+
+        nodes : in the unit interval;  ends : with the field's edges, else on the whole of it
+        """
+        axes = [np.append(nodes[nodes < last], last) if ends else last * nodes for last in self.places.extent]
         known: dict[tuple[float, float], FloatArray] = {}
-        for u, v in product(down.tolist(), across.tolist()):
+        for u, v in product(*(axis.tolist() for axis in axes)):
             known[u, v] = known[v, u].T if (v, u) in known else self.at(u, v)
-        return np.stack(list(known.values()))
+        return np.array(list(known)), np.stack([row.ravel() for row in known.values()])
+
+
+def _nodes(count: int) -> FloatArray:
+    """Return Gauss and Legendre's nodes in the unit interval."""
+    return (1 + np.polynomial.legendre.leggauss(count)[0]) / 2
 
 
 def _edges(camera: Camera, field: LensField, x: float, y: float, open_part: float) -> FloatArray:
@@ -103,16 +113,17 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
         check_waves(lens_type, field)
     rows = _FieldRows(KernelPlaces(camera, lens_type, _margin(camera, lens_type, fields)), fields)
     cells = rows.places.width**2
-    check_memory(COPIES * 8 * cells * max(CHARTS) ** 2, f"the kernels of lens type {lens_type.name}", "crop the target")
-    worst = np.inf
+    check_memory(
+        COPIES * 8 * cells * (1 + max(CHARTS)) ** 2, f"the kernels of lens type {lens_type.name}", "crop the target"
+    )
+    worst, (between, expected) = np.inf, rows.chart(_nodes(BETWEEN), ends=False)
     for count, degrees in CHARTS.items():
-        nodes = (1 + np.polynomial.legendre.leggauss(count)[0]) / 2
-        axes = [np.append(nodes[nodes < extent], extent) for extent in rows.places.extent]  # the corner among them
-        field, entries = np.array(list(product(*axes))), rows.quadrant(*axes).reshape(-1, cells)
+        field, entries = rows.chart(_nodes(count), ends=True)
         scale = float(entries[0].max())
         for degree in degrees:
             polynomials = _fitted(field, entries, rows.places.width, degree)
-            worst = float(np.abs(basis(field, degree) @ polynomials - entries).max()) / scale
+            known = (field, entries), (between, expected)
+            worst = max(float(np.abs(basis(at, degree) @ polynomials - every).max()) for at, every in known) / scale
             if worst <= TOLERANCE * (1 - SHARE) or (degree == HIGHEST and worst <= MOST):
                 return _components(rows.places, degree, polynomials, field, scale).times(float(lens_type.light))
     raise InputError(

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import ceil, pi
+from math import ceil, pi, sqrt
 
 import numpy as np
 
@@ -42,7 +42,7 @@ GRID_REACH = 40.0  # in units of `resolution`: a grid of a point-spread function
 class Wavefront:
     """The wave of one sensor point at one wavelength, at n nodes of the pupil.
 
-    wavelength : None for rays alone
+    wavelength : None for light without one
     cosines : (2, n) direction cosines of the lines from `centre` on the target to the nodes
     path : (n,) optical path from the sensor point through the node to `centre`, relative to the mean path
     light : (n,) share of the light that each node carries; the sum is `solid_angle`'s share 1
@@ -83,10 +83,15 @@ class Wavefront:
         """Largest distance of a ray from the centre, on the target."""
         return float(np.hypot(*self.hits).max())
 
-    @cached_property
+    @property
     def resolution(self) -> float:
         """Wavelength times the f-number on the target's side: 1 over the cut-off frequency of the MTF."""
         return 0.0 if self.wavelength is None else self.wavelength / (2 * self.half_width)
+
+    @property
+    def extent(self) -> float:
+        """Half the width of the grid that its point-spread function needs."""
+        return self.spot_radius + GRID_REACH * self.resolution
 
     def turned(self, angle: float) -> Wavefront:
         """Return the wave of a sensor point that is turned about the axis, from y towards -x."""
@@ -95,13 +100,16 @@ class Wavefront:
         return replace(self, cosines=turn @ self.cosines, hits=turn @ self.hits, centre=(float(x), float(y)))
 
 
-def node_counts(phase: float) -> tuple[int, int]:
-    """Return the numbers of nodes along the radius and around for an integrand whose phase spans `phase` rad a radius.
+def node_counts(half_width: float, spot: float, half: float) -> tuple[int, int]:
+    """Return the numbers of nodes along the radius and around with which a field is exact on a square about its centre.
 
+    half_width : of the direction cosines, over the wavelength;  spot : radius of the rays;  half : of the square's side
+    Over a radius the phase spans 2 pi half_width times the distance between a ray and a corner of the square.
     Gauss-Legendre integrates exp(i phase u), 0 < u < 1, to rounding from phase / 4 nodes plus a few, and the sum over n
     directions leaves the Bessel function J_n(phase), which vanishes from n = phase plus a few.
     """
-    counts = FEWEST[0] + ceil(0.35 * phase), FEWEST[1] + ceil(1.2 * phase)
+    phase = 2 * pi * half_width * (spot + sqrt(2) * half)
+    counts = FEWEST[0] + ceil(0.27 * phase), 4 * ceil((FEWEST[1] + 1.05 * phase) / 4)  # the axes among them
     if counts[0] * counts[1] > MOST_NODES:
         raise InputError(
             f"the wave oscillates {phase / (2 * pi):.3g} times over the radius of the pupil, more than can be computed;"
@@ -123,9 +131,9 @@ def thin_wavefront(aperture: float, depth: float, distance: float, focus: float,
 
     Its nodes serve a grid that reaches GRID_REACH beyond the spot.
     """
-    half, slack = aperture / 2, abs(1 - distance / focus)
-    phase = pi * aperture / wavelength / distance * (aperture * slack + GRID_REACH * wavelength * distance / aperture)
-    radius, angle, area = polar_nodes(node_counts(phase))
+    half = aperture / 2
+    spot, unit = half * abs(1 - distance / focus), wavelength * distance / aperture
+    radius, angle, area = polar_nodes(node_counts(0.5 / unit, spot, spot + GRID_REACH * unit))
     x = half * (radius * np.stack([np.cos(angle), np.sin(angle)])).reshape(2, -1)
     share = np.broadcast_to(area, (radius.size, angle.size)).ravel() * half**2
     square = np.square(x).sum(axis=0)
@@ -151,23 +159,23 @@ def wavefront_of(
     height: float,
     distance: float,
     wavelength: float | None,
-    reach: float = 0.0,
+    half: float = 0.0,
 ) -> Wavefront | None:
     """Trace the wave of the sensor point (0, height), `depth` behind the rear principal plane, to the target.
 
     distance : of the target; negative for the virtual point behind the lens from which divergent light comes
-    reach : in units of `resolution`, distance from the edge of the spot at which the field is still exact
+    half : of the side of a square about the centre in which the field is exact, at least `Wavefront.extent`
     Returns None if no light passes.
     """
     middle = _middle(prescription, disk, depth, height)
     if middle is None:
         return None
     pencil = _Pencil(prescription, disk, depth, height, distance, middle)
-    rays = _traced(pencil, None, RAY_NODES)
+    rays = replace(_traced(pencil, None, RAY_NODES), wavelength=wavelength)
     if wavelength is None:
         return rays
-    phase = 2 * pi / wavelength * rays.half_width * 2 * rays.spot_radius + pi * reach
-    return _traced(pencil, wavelength, node_counts(phase))
+    counts = node_counts(rays.half_width / wavelength, rays.spot_radius, max(half, rays.extent))
+    return _traced(pencil, wavelength, counts)
 
 
 @dataclass(frozen=True)

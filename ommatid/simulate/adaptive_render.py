@@ -4,10 +4,11 @@ variance of their mean is below a tenth of the sensor's in every pixel.
 A round renders those pixels of a sub-imager that need it (a stock sensor renders all), and its means and variances are
 its own: earlier rounds only determine how many samples it takes. A pixel is done once its variance, estimated from 16
 passes or more, is half of the allowed one, and rounds are planned for a quarter: so a variance that is underestimated
-by chance lets no bad pixel pass, and few rounds need another. Through pinholes, stratified samples make the variance
-fall like 1 / samples^1.5, since only those at the edges of pixels of f err. Where a grid of samples fits these edges
-none do: such sub-imagers begin with two passes of that grid, one sample per pixel of f (`sampling.passes`), and are
-done where these agree. Through displaced pinholes the averages of the picture over each pixel are exact
+by chance lets no bad pixel pass, and few rounds need another. A round takes at most four times the samples of the last
+one: few pixels need as many as the worst one, and the others are done before. Through pinholes, stratified samples make
+the variance fall like 1 / samples^1.5, since only those at the edges of pixels of f err. Where a grid of samples fits
+these edges none do: such sub-imagers begin with two passes of that grid, one sample per pixel of f (`sampling.passes`),
+and are done where these agree. Through displaced pinholes the averages of the picture over each pixel are exact
 (`renderer.averages`). Behind lenses points are Sobol's (`renderer.draws`) unless another sampler than the default is
 asked for. Behind thin lenses the picture is averaged over each pixel exactly (`renderer.averages`), and only the point
 spread is sampled. Behind surfaces a ray has four numbers and more: measured, the variance of Sobol's points is 1.5 to
@@ -63,7 +64,8 @@ DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, a
 LEAST = 256  # samples per pixel of a first round, at least
 MOST_FIRST = 2**14  # and at most
 DARK = WHITE / 16  # light whose noise counts for it
-MOST = 2**20  # samples per pixel of a round, at most
+MOST = 2**20  # samples per pixel of a round, at most,
+LEAP = 4  # and relative to the last one
 MOST_EXACT = 2**16  # samples per pixel of a pass whose sums are float64
 MOST_PASSES = 1024  # of all rounds of a sub-imager: they number its seeds
 SOBOL = "sobol"  # in records, Sobol's points of the pupil, and of the pixel where its averages are not exact
@@ -72,6 +74,7 @@ REACHED = "reached"  # how a sub-imager ends; otherwise the reason why it could 
 TIME, SAMPLES, FLOAT32 = "render.time is over", "no more samples are taken", "float32 rounds as much"
 AllowedVariance = Callable[[FloatArray, slice], FloatArray]  # of light on some measurements, and their slice
 SHARE = 0.1  # of the sensor's variance
+QUANTILES = np.linspace(0, 1, 11)  # of pixels, from which rays are predicted
 LONG = 60.0  # s, from which the cost of the rounds is said
 WORTH = 0.5  # of the planned rays, below which fewer samples are offered
 
@@ -197,11 +200,8 @@ class AdaptiveRounds:
 
     @property
     def planned_rays(self) -> float:
-        """Rays of the next round of every sub-imager that has not ended."""
-        return float(sum(self.sub_imagers[index].next.total * self._left(index) for index in self.unfinished))
-
-    def _left(self, index: int) -> int:
-        return int(self._open[self._slices[index]].sum())
+        """Rays of all rounds to come, as predicted."""
+        return sum(self.sub_imagers[index].left for index in self.unfinished)
 
     @property
     def enough(self) -> tuple[int, float]:
@@ -255,6 +255,7 @@ class AdaptiveRounds:
         sub.fewest = 0 if still.all() else sub.spent
         if still.any():
             sub.next = self._first(index)
+            sub.left = float(sub.next.total * still.sum())
         else:
             self._end(sub, index, FLOAT32)
         return sub
@@ -316,8 +317,10 @@ class AdaptiveRounds:
         sub.scatter = mean_of_known(variance) * sub.last.passes
         float64 = self._renderer.float32_samples(2) == 1
         most = MOST_EXACT if float64 else min(samples_within(values, AIM * target), MOST_SAMPLES)
-        total = sub.predicted_samples(float((variance / (AIM * target)).max()), most)
-        sub.next = self._grid(index, min(total, MOST), most)
+        factors = np.quantile(variance / (AIM * target), QUANTILES)
+        totals = [sub.predicted_samples(float(factor), most) for factor in factors]
+        sub.left = float(np.mean(totals)) * values.size
+        sub.next = self._grid(index, min(totals[-1], LEAP * sub.last.total, MOST), most)
         if sub.next.total < LEAPS[0] * sub.last.total or sub.seeds + sub.next.passes > MOST_PASSES:
             self._end(sub, index, SAMPLES)
         return still
@@ -392,6 +395,7 @@ class SubImagerProgress:
     """Progress of one sub-imager.
 
     next, last : plans of the next round and of the last one
+    left : rays of all rounds to come, as predicted
     spent : samples of all rounds per pixel that was in each of them;  fewest : the same for the first pixel to be done
     rays : of all rounds;  seeds : number of passes so far
     scatter : variance of one pass of the last round, mean over the unfinished pixels
@@ -401,6 +405,7 @@ class SubImagerProgress:
     next: Plan
     exponent: float
     last: Plan = field(default_factory=lambda: Plan(0, 0))
+    left: float = 0.0
     rounds: int = 0
     spent: int = 0
     fewest: int = 0

@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from math import exp, log
+from math import ceil, exp, log
 from typing import NamedTuple
 
 import numpy as np
@@ -227,7 +227,8 @@ class _PartMeans(_Picture):
     def of(cls, task: EstimationTask) -> _PartMeans | None:
         """Return that of a task, from readings spread over the pixels that they see; None of an image of few parts."""
         fine, detail = _unknowns(task), _detail(task)
-        side = detail * max(min(task.shape) // PARTS, -(-fine.windowed.reach // detail))
+        widest = max(each.ratio for each in fine.camera.types)  # what a reading sees but for the tails of a blur
+        side = detail * max(min(task.shape) // PARTS, ceil(widest / detail))
         shape = fine.camera.rows // side, fine.camera.columns // side
         if min(shape) < FEWEST_PARTS:
             return None

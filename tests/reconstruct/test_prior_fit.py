@@ -289,13 +289,22 @@ def test_detail_that_the_lens_averages_out_is_doubtful(contrast: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "horizon", "seeds"), [((60, 47), 20, 1), pytest.param((119, 119), 71, 20, marks=pytest.mark.slow)]
+    ("shape", "horizon", "seeds", "blurred"),
+    [
+        ((60, 47), 20, 1, False),
+        pytest.param((119, 119), 71, 20, False, marks=pytest.mark.slow),
+        pytest.param((119, 119), 71, 1, True, marks=pytest.mark.slow),
+    ],
 )
 def test_means_beside_a_horizon_that_no_window_shows(
-    shape: tuple[int, int], horizon: int, seeds: int, monkeypatch: pytest.MonkeyPatch
+    shape: tuple[int, int], horizon: int, seeds: int, blurred: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A bright sky over dark ground: means clear of the edge err by what is stated, without an overview by tens."""
+    """A bright sky over dark ground: means clear of the edge err by what is stated, without an overview by tens.
+
+    So they do behind apertures of 0.4 mm, of whose blur a few percent reach wider than a part of the overview.
+    """
     described = wide(shape, noise={"variance": 1.0}, prior={"kind": "fit"})
+    described = with_apertures(described, 0.4) if blurred else described
     model, scores = ideal_model(described, derive(described)), dict[float, list[float]]()
     for seed in range(seeds):
         picture = np.where(np.arange(shape[0])[:, None] < horizon, 215.0, 50.0)
@@ -310,7 +319,7 @@ def test_means_beside_a_horizon_that_no_window_shows(
                 true = float(picture[first : first + rows].mean())
                 scores.setdefault(excess, []).append((mean - true) / deviation)
     with_means, without = (float(np.sqrt(np.mean(np.square(each)))) for each in scores.values())
-    assert with_means < 2
+    assert with_means < (4 if blurred else 2)
     assert without > 30
 
 

@@ -301,7 +301,7 @@ def test_means_beside_a_horizon_that_no_window_shows(
 ) -> None:
     """A bright sky over dark ground: means clear of the edge err by what is stated, without an overview by tens.
 
-    So they do behind apertures of 0.4 mm, of whose blur a few percent reach wider than a part of the overview.
+    Behind apertures of 0.4 mm, whose blur reaches wider than a part of the overview, they err by some 2.5 times that.
     """
     described = wide(shape, noise={"variance": 1.0}, prior={"kind": "fit"})
     described = with_apertures(described, 0.4) if blurred else described

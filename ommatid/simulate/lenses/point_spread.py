@@ -74,12 +74,9 @@ def relative_intensity(wave: Wavefront, x: FloatArray, y: FloatArray) -> FloatAr
     return density(wave, x, y) * (_wavelength(wave) / wave.amplitude.sum()) ** 2
 
 
-def grid_of(wave: Wavefront, cells: int = CELLS) -> tuple[float, float]:
-    """Return the width of a cell and half the width of a grid for a wave.
-
-    cells : per wavelength times f-number
-    """
-    return wave.resolution / cells, wave.extent
+def grid_of(wave: Wavefront) -> tuple[float, float]:
+    """Return the width of a cell and half the width of a grid for a wave."""
+    return wave.resolution / CELLS, wave.extent
 
 
 def point_spread(wave: Wavefront, grid: tuple[float, float] | None = None) -> PointSpread:

@@ -16,9 +16,9 @@ import numpy as np
 
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.output.verdict_words import (
-    HALF_STEP,
-    HALF_STEP_HOW,
+    CHANGES,
     LEAST_GAIN,
+    SAMPLES,
     TIMES,
     follows_samples,
     is_trusted,
@@ -47,25 +47,15 @@ class NextStep:
     seconds: float | None = None
 
 
-# Cause, change, how to make it, and the factor on the cause's part of the error
-CHANGES = (
-    ("noise", "half the noise variance", "twice the light, or the mean of two frames", 0.5),
-    ("quantisation", HALF_STEP, HALF_STEP_HOW, 0.25),
-    ("frames", "twice the dark and flat frames", "`sensor.frames`", 0.5),
-    ("misalignment", "positions of the lenses calibrated", "`ommatid calibrate`, then `estimator.misalignment`", 0.0),
-)
-SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples`"}
-
-
 def next_steps(report: RunReport, other: AnotherType | None = None) -> list[NextStep]:
     """Return the changes that reduce the error by a twentieth or more, the best first; none for a run without trust."""
     now, budget = report.error.predicted_mse, report.error.budget
     if not is_trusted(report) or now <= 0:
         return []
     steps = [_samples(report)] if report.spent.more and follows_samples(report) else []
-    for name, change, how, factor in CHANGES:
+    for name, (words, how, factor) in CHANGES.items():
         part = budget.get(name, 0.0)
-        steps.append(NextStep(change, how, now - (1 - factor) * part, is_bound=True))
+        steps.append(NextStep(words, how, now - (1 - factor) * part, is_bound=True))
     if other is not None:
         how = f"{other.measurements} measurements more; `ommatid design` ranks others"
         words = f"another lens type, of magnification {other.magnification} on the pixel grid"

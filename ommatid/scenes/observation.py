@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from math import gcd
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,8 @@ from .lens_type import adjacent_slices
 if TYPE_CHECKING:
     from .camera import Camera
 
-ComplexArray = NDArray[np.complex128]
+ComplexArray = NDArray[np.complexfloating[Any]]
+Precision = type[np.float32] | type[np.float64]
 Value = TypeVar("Value")
 EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
 
@@ -39,11 +40,14 @@ class Seen:
     def __init__(self, image: FloatArray, padded: tuple[int, int]) -> None:
         """Take the grid on which kernels of all parts act without reaching around."""
         self.image, self.padded = image, padded
+        self._spectra: dict[Precision, ComplexArray] = {}
 
-    @cached_property
-    def spectrum(self) -> ComplexArray:
-        """The transform, which is computed when a part first needs it."""
-        return np.asarray(fft.rfft2(self.image, self.padded, workers=processors()))
+    def spectrum(self, precision: Precision) -> ComplexArray:
+        """Return the transform in float32 or float64, which is computed when a part first needs it."""
+        if precision not in self._spectra:
+            image = np.asarray(self.image, dtype=precision)
+            self._spectra[precision] = np.asarray(fft.rfft2(image, self.padded, workers=processors()))
+        return self._spectra[precision]
 
 
 class Back:
@@ -113,6 +117,11 @@ class ObservationPart(ABC):
     def is_slow(self) -> bool:
         """True if it takes many transforms of its own, and adds nothing but coefficients to a sum."""
         return False
+
+    @property
+    def cheaper(self) -> ObservationPart:
+        """About the same H in fewer or faster operations, with its exact transpose; itself where there are none."""
+        return self
 
     @abstractmethod
     def forward(self, seen: Seen, out: FloatArray) -> None:
@@ -258,6 +267,12 @@ class Observation:
     def reach(self) -> int:
         """Largest number of rows or of columns of f that a measurement spans."""
         return max(part.reach for part in self.parts)
+
+    @property
+    def cheaper(self) -> Observation:
+        """About the same H in fewer or faster operations; itself where there are none."""
+        parts = tuple(part.cheaper for part in self.parts)
+        return self if parts == self.parts else Observation(self.shape, parts)
 
     @cached_property
     def _padded(self) -> tuple[int, int]:

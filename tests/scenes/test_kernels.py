@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
-from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, read_kernels, terms
+from ommatid.scenes.fitted.kernels import LOSS, KernelFootprints, KernelPlaces, read_kernels, terms
 from ommatid.scenes.observation import Observation
 from ommatid.simulate.ideal import ideal_matrix
 from tests.examples import camera, with_optics
@@ -107,6 +107,31 @@ def test_every_kernel_of_the_mean_camera_is_the_mean_of_all() -> None:
     np.testing.assert_allclose(total, part.mean_kernel, atol=1e-14)
     assert part.variation == pytest.approx((squares / np.square(part.mean_kernel).sum()) ** 0.5, rel=1e-12)
     assert part.mean.variation == 0
+
+
+def smooth_kernels(index: int) -> KernelFootprints:
+    """Kernels that vary by a tenth over the field, then five times by a thousandth."""
+    part, rng = random_kernels(2, index=index), np.random.default_rng(index)
+    shapes = KernelShapes.dense(np.abs(rng.normal(size=(7, part.reach, part.reach))))
+    coefficients = rng.normal(size=(7, 6)) * np.array([[0.0, 0.1, *[0.001] * 5]]).T
+    coefficients[0, 0] = 1.0
+    return replace(part, shapes=shapes, coefficients=coefficients, error_coefficients=part.error_coefficients[:0, :0])
+
+
+def test_a_cheaper_h_leaves_out_what_hardly_varies_and_has_its_own_transpose() -> None:
+    exact = smooth_kernels(1)
+    cheaper = exact.cheaper
+    assert cheaper.shapes.count == 2
+    full, less = (Observation(CAMERA.shape, (each,)) for each in (exact, cheaper))
+    off = (less.to_sparse() - full.to_sparse()).toarray()
+    lost = np.square(off).sum(axis=1).mean() ** 0.5 / np.linalg.norm(exact.mean_kernel)
+    assert 1e-4 < lost < LOSS
+    rng = np.random.default_rng(3)
+    image, readings = rng.normal(size=less.unknowns), rng.normal(size=less.measurements)
+    np.testing.assert_allclose(less.forward(image), less.to_sparse() @ image, atol=1e-5 * np.abs(image).max())
+    assert readings @ less.forward(image) == pytest.approx(less.adjoint(readings) @ image, rel=1e-5)
+    alike = exact.mean, random_kernels(2)
+    assert [each.cheaper for each in alike] == list(alike)
 
 
 FINE = {

@@ -7,9 +7,10 @@ standard deviation. With the residual r = b - K x, the Cauchy-Schwarz inequality
 |x_i - x*_i| <= sqrt(C_ii) sqrt(r^T K^-1 r) for every pixel i. Since K >= P0^-1, r^T K^-1 r is at most r^T P0 r, for
 any H.
 
-With independent pixels K couples only pixels that one sensor pixel sees, so that its Cholesky factor has a band as wide
-as a few lines of the frame. Factorised, it serves frames of some ten thousand pixels whatever the lens types leave
-open; conjugate gradients with a preconditioner serve larger ones, and kernels of any width.
+The preconditioner P is an argument. With independent pixels K couples only pixels that one sensor pixel sees, so that
+its Cholesky factor has a band as wide as a few lines of the frame: C itself for frames of some ten thousand pixels,
+whatever the lens types leave open. Transfer functions serve larger ones, and kernels of any width; where many kernels
+describe the field, P is some steps with the few that matter most.
 """
 
 from __future__ import annotations
@@ -44,9 +45,10 @@ MAX_STEPS = 600
 MAX_STARTS = 3  # each from the recomputed residual
 SAFETY = 0.5  # of the least eigenvalue of P K, which the Lanczos matrix overestimates
 MOST_WORK = 1.2e11  # pixels times the square of the band: a minute or two with the error bars
-MAX_REFINEMENTS = 4
 EVEN = 0.1  # relative range of weights for which no scaling is tried
 TRIAL_STEPS = 10  # with each of two preconditioners, where noise is uneven
+REDUCTION = 0.1  # of a residual by steps with a cheaper H; more of them would follow what it lacks
+MOST_INNER, MOST_OUTER = 60, 100  # such steps, and times that they are taken
 LEAST_LOCAL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
 
 
@@ -149,15 +151,21 @@ class FrameSystem:
     def _after_trial(self, candidate: Bands) -> float:
         """Return the bound that a few steps with a preconditioner reach."""
         right = self.apply(probe(Purpose.PRECONDITIONER).normal(size=self.observation.unknowns))
-        return replace(self, similar=candidate)._steps(right, TRIAL_STEPS)
+        return replace(self, similar=candidate).steps(right, TRIAL_STEPS)[1]
 
-    def _steps(self, right: FloatArray, count: int) -> float:
-        image, lanczos = np.zeros_like(right), _Lanczos()
+    def steps(self, right: FloatArray, most: int, reduction: float = 0.0) -> tuple[FloatArray, float]:
+        """Return about C b and the bound on its error, after `most` steps or when that is `reduction` times the first.
+
+        right : (N,) b
+        """
+        image, lanczos, bound = np.zeros_like(right), _Lanczos(), np.inf
+        least = reduction * self._bound(right)
         with one_thread():
             for residual in self._residuals(image, right.copy(), lanczos):
-                if lanczos.count == count:
-                    return self._bound(residual)
-        return np.inf
+                bound = self._bound(residual)
+                if bound <= least or lanczos.count >= most:
+                    break
+        return image, bound
 
     @property
     def _types(self) -> Sequence[slice]:
@@ -209,25 +217,31 @@ class FrameSystem:
         self, start: FloatArray, start_residual: FloatArray, accuracy: float, before: _Lanczos, progress: Progress
     ) -> tuple[FloatArray, _Lanczos]:
         """Run conjugate gradients from `start` until the recursive residual meets the bound."""
-        image, lanczos = start.copy(), _Lanczos()
-        first = self._bound(start_residual)
+        image, lanczos, first = start.copy(), _Lanczos(), self._bound(start_residual)
+        most = MOST_OUTER if isinstance(self.similar, Refined) else MAX_STEPS
         for residual in self._residuals(image, start_residual.copy(), lanczos):
             bound = self._bound(residual)
             if lanczos.count:
                 progress(min(1.0, float(np.log(first / bound) / np.log(first / accuracy)) if bound > 0 else 1.0))
             if bound <= accuracy:
                 break
-            if lanczos.count >= MAX_STEPS or not np.isfinite(bound):
+            if lanczos.count >= most or not np.isfinite(bound):
                 raise NotReachedError(self._not_reached(bound, lanczos.count, accuracy))
         return image, lanczos if lanczos.count else before
 
     def _residuals(self, image: FloatArray, residual: FloatArray, lanczos: _Lanczos) -> Iterator[FloatArray]:
-        """Yield the residual before each step of conjugate gradients, which change `image` and `residual`."""
+        """Yield the residual before each step of conjugate gradients, which change `image` and `residual`.
+
+        Where P is itself an iteration, no fixed matrix, the new direction is conjugate to the last one all the same
+        (Notay 2000, Eq. 4).
+        """
         direction, energy = None, 1.0
+        before = np.empty_like(residual) if isinstance(self.similar, Refined) else None
         while True:
             yield residual
             conditioned = self._precondition(residual)
             previous, energy = energy, float(residual @ conditioned)
+            change = energy if before is None else energy - float(before @ conditioned)
             if not energy > 0:
                 raise NotReachedError(
                     "the frame solver's preconditioner is not positive in double precision; set estimator.method ="
@@ -237,8 +251,10 @@ class FrameSystem:
                 direction = conditioned
             else:
                 lanczos.ratios.append(energy / previous)
-                direction *= energy / previous
+                direction *= change / previous
                 direction += conditioned
+            if before is not None:
+                before[:] = residual
             product = self.apply(direction)
             lanczos.lengths.append(energy / float(direction @ product))
             image += lanczos.lengths[-1] * direction
@@ -262,6 +278,23 @@ class FrameSystem:
     def _precondition(self, image: FloatArray) -> FloatArray:
         preconditioner = self.preconditioner
         return image if preconditioner is None else preconditioner.solve(image.reshape(self.shape)).ravel()
+
+
+@dataclass(frozen=True)
+class Refined:
+    """P of a system by some steps of another one whose H is cheaper and nearly the same."""
+
+    system: FrameSystem
+
+    @classmethod
+    def of(cls, system: FrameSystem, similar: Preconditioner | None) -> Preconditioner | None:
+        """Return that of a system with cheaper kernels, whose own P is `similar`; that itself where there are none."""
+        cheaper = system.observation.cheaper
+        return similar if cheaper is system.observation else cls(replace(system, observation=cheaper, similar=similar))
+
+    def solve(self, image: FloatArray) -> FloatArray:
+        """Return about C b: (rows, columns) to (rows, columns)."""
+        return self.system.steps(image.ravel(), MOST_INNER, REDUCTION)[0].reshape(image.shape)
 
 
 def frame_system(task: EstimationTask) -> FrameSystem:
@@ -327,62 +360,40 @@ class _Lanczos:
 
 
 @dataclass(frozen=True)
-class BandedSystem(FrameSystem):
-    """K of a frame of independent pixels; `matrix`, (M, N), is H."""
+class BandedFactor:
+    """C of a frame of independent pixels, by the Cholesky factor of K; as P it leaves no more than rounding.
 
+    matrix : (M, N) H
+    """
+
+    system: FrameSystem
     matrix: sparse.csr_array
 
     @cached_property
-    def precision(self) -> sparse.csr_array:
-        """K: (N, N)."""
-        information = self.matrix.T @ sparse.csr_array(self.matrix.multiply(self.weights[:, None]))
-        diagonal = sparse.eye_array(self.matrix.shape[1], format="csr")
-        return sparse.csr_array(information + float(np.asarray(self.prior)) * diagonal)
-
-    @cached_property
     def _order(self) -> Indices:
-        return shorter_side_first(self.shape)
+        """The pixels in the order that makes the band of K narrow: (N,)."""
+        numbers: Indices = np.arange(self.system.observation.unknowns).reshape(self.system.shape)
+        return (numbers if numbers.shape[1] <= numbers.shape[0] else numbers.T).ravel()
 
     @cached_property
     def _factor(self) -> FloatArray:
-        return banded_cholesky(self.precision, self._order)
+        """The lower factor of K with its pixels in this order, as SciPy stores bands: (width, N)."""
+        information = self.matrix.T @ sparse.csr_array(self.matrix.multiply(self.system.weights[:, None]))
+        precision = sparse.csr_array(
+            information + float(np.asarray(self.system.prior)) * sparse.eye_array(self._order.size)
+        )
+        ordered = sparse.coo_array(precision[self._order][:, self._order])
+        below = ordered.row >= ordered.col
+        row, column, values = ordered.row[below], ordered.col[below], ordered.data[below]
+        band = np.zeros((int((row - column).max(initial=0)) + 1, ordered.shape[0]))
+        band[row - column, column] = values
+        return np.asarray(linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False))
 
-    def solve(self, right: FloatArray, accuracy: float = ACCURACY, progress: Progress = no_progress) -> Solution:
-        """Return C b with an error of at most `accuracy` posterior standard deviations in every pixel.
-
-        Raises NotReachedError if rounding prevents it.
-        """
-        image, residual, bound, steps = np.zeros_like(right), right, np.inf, 0
-        while steps <= MAX_REFINEMENTS and not bound <= accuracy:
-            change = np.empty_like(right)
-            change[self._order] = linalg.cho_solve_banded((self._factor, True), residual[self._order])
-            image = image + change
-            residual = right - self.apply(image)
-            bound, steps = self._bound(residual), steps + 1
-        if not bound <= accuracy:
-            raise NotReachedError(
-                f"the banded solver reached {bound:.2g} posterior standard deviations, expected {accuracy:g}; set"
-                " estimator.method = 'tiles', or raise estimator.accuracy"
-            )
-        progress(1.0)
-        largest = float(abs(self.precision).sum(axis=1).max())
-        return Solution(image, steps, bound, largest / float(np.asarray(self.prior)))
-
-
-def shorter_side_first(shape: tuple[int, int]) -> Indices:
-    """Return the pixels of a frame in the order that makes the band of K narrow: (N,)."""
-    numbers: Indices = np.arange(shape[0] * shape[1]).reshape(shape)
-    return (numbers if shape[1] <= shape[0] else numbers.T).ravel()
-
-
-def banded_cholesky(precision: sparse.csr_array, order: Indices) -> FloatArray:
-    """Return the lower Cholesky factor of K with its pixels in this order, as SciPy stores bands: (width, N)."""
-    ordered = sparse.coo_array(precision[order][:, order])
-    below = ordered.row >= ordered.col
-    row, column, values = ordered.row[below], ordered.col[below], ordered.data[below]
-    band = np.zeros((int((row - column).max(initial=0)) + 1, ordered.shape[0]))
-    band[row - column, column] = values
-    return np.asarray(linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False))
+    def solve(self, image: FloatArray) -> FloatArray:
+        """Return C b: (rows, columns) to (rows, columns)."""
+        solved = np.empty(image.size)
+        solved[self._order] = linalg.cho_solve_banded((self._factor, True), image.ravel()[self._order])
+        return solved.reshape(image.shape)
 
 
 def serves(camera: Camera) -> bool:

@@ -23,7 +23,7 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.observation import Entries
 
 from ..methods.method import EstimationTask
-from .conjugate_gradients import BandedSystem, FrameSystem, NotReachedError, leaves_null_space
+from .conjugate_gradients import BandedFactor, FrameSystem, NotReachedError, leaves_null_space
 from .reading_space import ReadingSpace
 from .swept import swept_maps
 from .variance_map import VarianceMap, frame_map, is_narrow, is_uneven, unseen_corners, ways_to_edges
@@ -174,10 +174,10 @@ def _fastest_map(task: EstimationTask, system: FrameSystem, actual: FloatArray) 
 
 def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iterator[VarianceMap]:
     """Yield maps from the fastest to the most accurate one."""
-    if isinstance(system, BandedSystem):
+    if isinstance(system.similar, BandedFactor):
         ratios = task.on_all_measurements(actual / task.expected_noise, 0.0)
         prior, reach = float(np.asarray(system.prior)), task.model.windowed.reach
-        yield VarianceMap(*swept_maps(system.matrix, system.weights, ratios, prior, task.shape, reach))
+        yield VarianceMap(*swept_maps(system.similar.matrix, system.weights, ratios, prior, task.shape, reach))
         return
     if system.bands is None:
         raise TypeError("expected a system with a preconditioner")

@@ -18,7 +18,6 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import Purpose, probe
-from ommatid.scenes.fitted.kernels import KernelFootprints
 
 from ..coarse_model import CAUSE as DETAIL
 from ..coarse_model import world_of
@@ -38,8 +37,9 @@ from ..prior import coloured
 from ..verdict.residual import ResidualInputs, ResidualPower
 from .bands import Bands
 from .conjugate_gradients import (
-    BandedSystem,
+    BandedFactor,
     FrameSystem,
+    Refined,
     Solution,
     frame_system,
     mean_accuracy,
@@ -49,6 +49,7 @@ from .conjugate_gradients import (
 from .error_map import MANY, ErrorMap, error_map, is_invariant
 from .reading_space import ReadingSpace, moments_of
 from .variance_map import VarianceMap, mean_ratios
+from .windows import of_mean_kernels
 
 NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is factorised"
 INVARIANT = "every lens type is shift-invariant except at the edges"
@@ -101,8 +102,9 @@ class FrameMethod(Method):
         """The linear system of the frame."""
         system = frame_system(self.task)
         if self._banded:
-            banded = BandedSystem(system.observation, system.weights, system.prior, self.task.model.matrix)
-            return self.shared("system", self.conditions(), lambda: banded)[0]
+            exact, matrix = replace(system, bands=None), self.task.model.matrix
+            factor, _ = self.shared("factor", self.conditions(), lambda: BandedFactor(exact, matrix))
+            return replace(exact, similar=factor)
         if ReadingSpace.serves(self.task):
             conditions = replace(self.conditions(), assumed=np.ones(0))
             found, _ = self.shared("moments", conditions, lambda: moments_of(self.task))
@@ -111,9 +113,9 @@ class FrameMethod(Method):
                 return replace(system, similar=space)
         variances = np.divide(1, system.mean_weights, dtype=np.float64)
         conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
-        nearly = _with_mean_kernels(system)
+        nearly = replace(system, observation=of_mean_kernels(system.observation))  # in which steps are fast
         similar, _ = self.shared("preconditioner", conditions, lambda: nearly.preconditioner, SIMILAR)
-        return replace(system, similar=similar)
+        return replace(system, similar=Refined.of(system, similar))
 
     @cached_property
     def solution(self) -> Solution:
@@ -369,10 +371,3 @@ class FrameMethod(Method):
         waves: FloatArray = np.asarray(fft.dctn(bias * np.sqrt(local), 2, norm="ortho"), dtype=np.float64)
         along, squares = (noise * np.square(waves)).sum(), np.square(noise).sum() * np.square(local).mean()
         return float(np.square(bias).sum()), float(4 * along + 2 * squares)
-
-
-def _with_mean_kernels(system: FrameSystem) -> FrameSystem:
-    """Return the system in which preconditioners are tried, fast: kernels are their mean over the field."""
-    every = system.observation.parts
-    parts = (part.mean if isinstance(part, KernelFootprints) and part.degree else part for part in every)
-    return replace(system, observation=replace(system.observation, parts=tuple(parts)))

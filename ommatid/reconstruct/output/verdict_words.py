@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 from math import sqrt
+from typing import NamedTuple
 
 from ..verdict.verdict import SPURIOUS_SHARE
 from .run_json import RunReport
 
 TIMES = 4  # as many samples, in the sentence on more samples
 LEAST_GAIN = 0.05  # relative fall of the error from which a change is worth a sentence
-HALF_STEP = "half the quantisation step"
+
+
+class Change(NamedTuple):
+    """A change of the scene that reduces one cause's part of the error by a known factor, and how to make it."""
+
+    words: str
+    how: str
+    factor: float
+
+
 # The step of a [sensor] is 1 DN, that is 1 / gain electrons: bits alone raise the range, and the gain alone halves it.
-HALF_STEP_HOW = "one more of `noise.bits`, or `sensor.gain` doubled with one more of `sensor.bits`"
-# Causes with a simple law: the change, the factor on their part of the error, and its name
-CHANGES = {
-    "noise": ("half the noise variance", 0.5),
-    "quantisation": (f"{HALF_STEP} ({HALF_STEP_HOW})", 0.25),
-    "frames": ("twice the dark and flat frames", 0.5),
-    "misalignment": ("a camera without misalignment", 0.0),
+HALF_STEP = "one more of `noise.bits`, or `sensor.gain` doubled with one more of `sensor.bits`"
+CHANGES = {  # by the cause's name in the budget
+    "noise": Change("half the noise variance", "twice the light, or the mean of two frames", 0.5),
+    "quantisation": Change("half the quantisation step", HALF_STEP, 0.25),
+    "frames": Change("twice the dark and flat frames", "`sensor.frames`", 0.5),
+    "misalignment": Change(
+        "positions of the lenses calibrated", "`ommatid calibrate`, then `estimator.misalignment`", 0.0
+    ),
 }
 SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples`"}
 
@@ -93,8 +104,9 @@ def _change(name: str, part: float, report: RunReport) -> str:
     if name == "null_space":
         return "; neither samples nor less noise reduce it (`ommatid design` computes what another lens type brings)"
     if name in CHANGES:
-        words, factor = CHANGES[name]
-        return f"; {words}: {_fall(now, now - (1 - factor) * part)}"
+        change = CHANGES[name]
+        words = f"{change.words} ({change.how})" if name == "quantisation" else change.words
+        return f"; {words}: {_fall(now, now - (1 - change.factor) * part)}"
     if name not in SAMPLES or not follows_samples(report):
         return ""
     more = next((more for more in report.spent.more if more.times == TIMES), None)

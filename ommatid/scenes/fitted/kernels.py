@@ -28,11 +28,13 @@ from ommatid.runtime.machine import check_memory, processors
 
 from ..camera import Camera
 from ..lens_type import LensType
-from ..observation import Back, ComplexArray, ObservationPart, Seen, padded_shape
+from ..observation import Back, ComplexArray, ObservationPart, Precision, Seen, padded_shape
 from .kernel_shapes import KernelShapes, Numbers
 
 ENTRY = 24  # bytes of an entry of a matrix while it is made
 MOST_DEGREE = 50  # of polynomials in a file
+LOSS = 0.01  # RMS of what the kernels of a cheaper H leave out, relative
+SAVING = 3  # times fewer they are at least, or the steps that they cost are more than those saved
 
 
 def terms(degree: int) -> list[tuple[int, int]]:
@@ -188,11 +190,13 @@ class _Grid:
 
         total : (rows, columns / 2 + 1);  readings : (sensor rows, sensor columns)
         """
-        placed = np.zeros(self._folded)
+        placed = np.zeros(self._folded, total.real.dtype)
         if isinstance(self._places[0], slice):
             np.multiply(readings, weight, out=placed[self._places])
         else:
-            np.add.at(placed, self._places, weight * readings)  # several may begin at one pixel
+            np.add.at(
+                placed, self._places, np.asarray(weight * readings, placed.dtype)
+            )  # several may begin at one pixel
         transform = fft.rfft2 if self.every == 1 else fft.fft2
         spectrum = np.asarray(transform(placed, workers=processors(), overwrite_x=True))
         np.conj(spectrum, out=spectrum)
@@ -209,6 +213,7 @@ class KernelFootprints(ObservationPart):
 
     shapes : S kernels, the mean kernel first, and E of errors;  coefficients : (S, P) of their polynomials, of `degree`
     error_coefficients : (q, E, P): directions of the error of H, each of variance 1
+    precision : of products with an image and of sums of readings
     """
 
     places: KernelPlaces
@@ -216,6 +221,7 @@ class KernelFootprints(ObservationPart):
     shapes: KernelShapes
     coefficients: FloatArray
     error_coefficients: FloatArray
+    precision: Precision = np.float64
     _grids: dict[tuple[int, int], _Grid] = field(default_factory=dict[tuple[int, int], "_Grid"], init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -266,9 +272,10 @@ class KernelFootprints(ObservationPart):
 
     def forward(self, seen: Seen, out: FloatArray) -> None:
         """Write H f to `out`, (measurements of the type,)."""
-        grid, total, room = self._grid(seen.padded), np.zeros(self.places.sensor), np.empty_like(seen.spectrum)
+        grid, total, spectrum = self._grid(seen.padded), np.zeros(self.places.sensor), seen.spectrum(self.precision)
+        room = np.empty_like(spectrum)
         for transfer, weight in zip(grid.transfers, self._applied_weights, strict=True):
-            read = grid.read(seen.spectrum, transfer, room)
+            read = grid.read(spectrum, transfer, room)
             read *= weight
             total += read
         out[:] = total.ravel()[self.places.order]
@@ -277,7 +284,7 @@ class KernelFootprints(ObservationPart):
         """Add H^T g to `back`; readings : (measurements of the type,)."""
         grid, ordered = self._grid(back.padded), np.empty(self.places.sensor)
         ordered.ravel()[self.places.order] = readings
-        total = np.zeros((back.padded[0], back.padded[1] // 2 + 1), dtype=np.complex128)
+        total = np.zeros((back.padded[0], back.padded[1] // 2 + 1), grid.transfers[0].dtype)
         for number, weight in enumerate(self._applied_weights):
             grid.add_spread(total, ordered, weight, number)
         back.add_spectrum(np.conj(total, out=total))
@@ -323,7 +330,7 @@ class KernelFootprints(ObservationPart):
             placed = np.zeros(padded)
             placed[np.ix_(first % padded[0], beside % padded[1])] = kernel
             spectrum = np.asarray(fft.rfft2(placed, workers=processors(), overwrite_x=True))
-            yield np.conj(spectrum, out=spectrum)
+            yield np.conj(spectrum, out=spectrum).astype(np.result_type(self.precision, 1j), copy=False)
 
     @property
     def is_slow(self) -> bool:
@@ -446,14 +453,39 @@ class KernelFootprints(ObservationPart):
             self, degree=0, shapes=shapes, coefficients=np.ones((1, 1)), error_coefficients=np.zeros((0, 0, 1))
         )
 
+    @cached_property
+    def _components(self) -> tuple[FloatArray, FloatArray]:
+        """What the kernels differ by from their mean: orthonormal components, (S, W^2), and the RMS of each, (S,)."""
+        weights = np.array([np.ravel(every) for every in self._weights(self.coefficients)])  # (S, readings) or (S, 1)
+        apart = weights - weights.mean(axis=1, keepdims=True)
+        values, vectors = np.linalg.eigh(apart @ apart.T / apart.shape[1])
+        strong = (vectors * np.sqrt(np.maximum(values, 0.0))).T @ self.shapes.kernels.reshape(len(weights), -1)
+        _, sizes, components = np.linalg.svd(strong, full_matrices=False)
+        return components, sizes / float(np.linalg.norm(self.mean_kernel))
+
     @property
     def variation(self) -> float:
         """RMS difference of the kernels over the field from their mean, relative to that."""
-        weights = np.array([np.ravel(every) for every in self._weights(self.coefficients)])  # (S, readings) or (S, 1)
-        flat, mean = self.shapes.kernels.reshape(len(weights), -1), weights.mean(axis=1)
-        products, apart = flat @ flat.T, weights - mean[:, None]
-        squares = np.einsum("sr,st,tr->r", apart, products, apart, optimize=True)
-        return float(np.sqrt(squares.mean() / (mean @ products @ mean)))
+        return float(np.linalg.norm(self._components[1]))
+
+    @property
+    def cheaper(self) -> KernelFootprints:
+        """About the same H in single precision, by the fewest kernels whose RMS difference from these is small."""
+        if self.degree == 0:  # which costs one product, and the prior's transforms take longer
+            return self
+        components, sizes = self._components
+        left = np.sqrt(np.cumsum(np.square(sizes[::-1]))[::-1])  # by leaving out each component and those after it
+        kept = components[left > LOSS]
+        if SAVING * (1 + len(kept)) > len(self._applied[0]):
+            return self
+        flat = self.shapes.kernels.reshape(self.shapes.count, -1)
+        apart = self.coefficients.copy()
+        apart[:, 0] -= self._means
+        coefficients = np.concatenate([np.eye(1, apart.shape[1]), kept @ flat.T @ apart])
+        kernels = np.concatenate([self.mean_kernel.reshape(1, -1), kept])
+        shapes = KernelShapes.dense(kernels.reshape(-1, self.places.width, self.places.width))
+        none = np.zeros((0, 0, apart.shape[1]))
+        return replace(self, shapes=shapes, coefficients=coefficients, error_coefficients=none, precision=np.float32)
 
     @property
     def _means(self) -> FloatArray:
@@ -464,11 +496,11 @@ class KernelFootprints(ObservationPart):
     def error_directions(self, image: FloatArray) -> FloatArray:
         """Return L, (measurements of the type, q): the error of H f is L xi, with independent xi of variance 1."""
         padded, image = padded_shape(self.shape, self.reach, self.spacing), np.asarray(image, dtype=np.float64)
-        grid, seen = self._grid_of(padded, []), Seen(image.reshape(self.shape), padded)
+        grid, spectrum = self._grid_of(padded, []), Seen(image.reshape(self.shape), padded).spectrum(self.precision)
         transfers = self._transfers_of(self.shapes.error_kernels, padded)
-        every, room = np.zeros((self.error_coefficients.shape[1], *self.places.sensor)), np.empty_like(seen.spectrum)
+        every, room = np.zeros((self.error_coefficients.shape[1], *self.places.sensor)), np.empty_like(spectrum)
         for out, transfer in zip(every, transfers, strict=True):
-            out[:] = grid.read(seen.spectrum, transfer, room)
+            out[:] = grid.read(spectrum, transfer, room)
         (directions, kernels, _), (rows, columns) = self.error_coefficients.shape, self.places.sensor
         down, across = self._polynomials
         count = self.degree + 1
@@ -501,7 +533,7 @@ def _folded(half: ComplexArray, size: int, length: int) -> ComplexArray:
 
     They are sums of aliases.
     """
-    total, kept = np.zeros((len(half), length // 2 + 1), dtype=np.complex128), length // 2
+    total, kept = np.zeros((len(half), length // 2 + 1), half.dtype), length // 2
     for first in range(0, size, length):
         if 2 * first < size:
             total += half[:, first : first + kept + 1]

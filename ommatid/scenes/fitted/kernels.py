@@ -194,9 +194,8 @@ class _Grid:
         if isinstance(self._places[0], slice):
             np.multiply(readings, weight, out=placed[self._places])
         else:
-            np.add.at(
-                placed, self._places, np.asarray(weight * readings, placed.dtype)
-            )  # several may begin at one pixel
+            weighted = np.asarray(weight * readings, placed.dtype)
+            np.add.at(placed, self._places, weighted)  # several may begin at one pixel
         transform = fft.rfft2 if self.every == 1 else fft.fft2
         spectrum = np.asarray(transform(placed, workers=processors(), overwrite_x=True))
         np.conj(spectrum, out=spectrum)
@@ -235,7 +234,7 @@ class KernelFootprints(ObservationPart):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs: transfer functions are computed again there."""
-        made = ("_applied", "_applied_weights")
+        made = ("_applied", "_applied_weights", "_components", "_cheaper")
         return {name: value for name, value in self.__dict__.items() if name not in made} | {"_grids": {}}
 
     @property
@@ -471,6 +470,10 @@ class KernelFootprints(ObservationPart):
     @property
     def cheaper(self) -> KernelFootprints:
         """About the same H in single precision, by the fewest kernels whose RMS difference from these is small."""
+        return self._cheaper
+
+    @cached_property
+    def _cheaper(self) -> KernelFootprints:
         if self.degree == 0:  # which costs one product, and the prior's transforms take longer
             return self
         components, sizes = self._components

@@ -52,7 +52,8 @@ from .prior_fit import PriorFit, fit_prior
 Result = TypeVar("Result")
 
 NEGLIGIBLE = 0.01  # share of the noise, up to which the uncertainty of H needs no second look
-RENDERING = 0.03  # relative deviation of the error by rendering from that of its stated variances, of few passes
+RENDERING = 0.03  # relative deviation of the error by rendering from that of its stated variances, of few passes, and
+FEW_SAMPLES = 0.4  # over the samples of a pass: where few miss an edge, the variance is small and the weight large
 
 
 def _needs_no_matrix(stack: Stack, model: Model) -> bool:
@@ -67,6 +68,7 @@ class Assumptions:
 
     contrast : of the true image, where the uncertainty of H depends on it
     shared_image : (N,) on which errors of few numbers of H act, None where they are no part of the noise
+    of_rendering : relative deviation of the error by rendering from that of its stated variances
     """
 
     method: Method
@@ -76,6 +78,7 @@ class Assumptions:
     fit: PriorFit | None
     contrast: Contrast | None = None
     shared_image: FloatArray | None = None
+    of_rendering: float = RENDERING
 
     def result(self, truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error, with what errors of H and of rounding do beyond noise where that matters.
@@ -126,7 +129,7 @@ class Assumptions:
     def _without_attenuation(self, noise: Noise, truth: FloatArray | None) -> MethodResult:
         """Return the result of the method, whose interval allows for what is not known of the rendering's variance."""
         result = self.method.result(noise, truth)
-        unknown = RENDERING * result.expected.parts.get("rendering", 0.0)
+        unknown = self.of_rendering * result.expected.parts.get("rendering", 0.0)
         if result.interval is None or not unknown:
             return result
         given, count = result.interval, result.image.size
@@ -154,7 +157,7 @@ def assumptions_at(
         recorded = of_image.forward(np.full(of_image.unknowns, prior.mean))
         observation = replace(observation, stack=replace(stack, values=recorded))
     method = METHODS[choice.method](observation.task(observation.expected_noise(noise)), execution)
-    return Assumptions(method, usable, prior, noise, None)
+    return Assumptions(method, usable, prior, noise, None, of_rendering=_of_rendering(stack))
 
 
 def method_for(stack: Stack, model: Model) -> Method:
@@ -257,7 +260,14 @@ def _assumptions(
         noise = observation.with_shared(noise, shared)
     if not fixed and (contrast is not None or SHARED in noise):
         method = method_with(observation, noise, shared)
-    return Assumptions(method, observation.usable, observation.prior, noise, fit, contrast, shared)
+    deviation = _of_rendering(stack)
+    return Assumptions(method, observation.usable, observation.prior, noise, fit, contrast, shared, deviation)
+
+
+def _of_rendering(stack: Stack) -> float:
+    """Return the relative deviation of the error by rendering from that of its stated variances."""
+    samples, passes = (int(stack.record.get(name) or 0) for name in ("samples", "passes"))
+    return max(RENDERING, FEW_SAMPLES * passes / samples) if samples else RENDERING
 
 
 def _shared_image(method: Method, noise: Noise, image: FloatArray | None) -> FloatArray | None:

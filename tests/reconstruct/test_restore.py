@@ -80,6 +80,36 @@ def test_the_parts_of_the_budget_add_up() -> None:
     assert [bare.budget()[name] for name in ("noise", "quantisation", "calibration", "detail")] == [0] * 4
 
 
+def test_few_samples_in_a_pass_widen_the_interval() -> None:
+    """A pixel whose few samples miss an edge has too small a variance and too large a weight."""
+    described = scene(lenses=THREE, calibration={"method": "ideal"}, render={"variant": "scalar_rgb", "samples": 64})
+    stack, model, few = chain(described)
+    many = restore(replace(stack, record=stack.record | {"samples": 4096}), model, load(described).ravel())
+    assert few.interval is not None
+    assert many.interval is not None
+    (few_deviation, few_share), (deviation, share) = (
+        (each.interval.variance**0.5 / each.expected.mse, each.budget()["rendering"] / each.expected.mse)
+        for each in (few, many)
+        if each.interval is not None
+    )
+    assert few_share == share
+    added = (few_deviation**2 - deviation**2) ** 0.5
+    assert added == pytest.approx(share * (0.1**2 - 0.03**2) ** 0.5, rel=0.05)
+
+
+@pytest.mark.slow
+def test_the_error_of_a_rendering_of_few_samples_lies_inside_its_interval() -> None:
+    """Twenty seeds of 64 samples, whose rendering is two thirds of the error; two lay outside without the allowance."""
+    inside = 0
+    for seed in range(20):
+        changes = ["render.samples=64", "calibration.method=ideal", "prior.kind=independent", f"render.seed={seed}"]
+        _, _, restoration = chain(read(GALLERY / "tile41.toml", changes))
+        assert restoration.error is not None
+        assert restoration.interval is not None
+        inside += restoration.interval.low < restoration.error.mse < restoration.interval.high
+    assert inside >= 19
+
+
 def test_the_actual_noise_is_in_the_variance_whatever_the_estimator_expects() -> None:
     described = scene(lenses=THREE, noise={"variance": 4.0}, calibration={"method": "ideal"})
     stack, model, matched = chain(described)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import pairwise, product, starmap
 from math import gcd
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 ComplexArray = NDArray[np.complexfloating[Any]]
 Precision = type[np.float32] | type[np.float64]
 Value = TypeVar("Value")
+GROUPS = 8  # of parts that are computed side by side, whatever the number of threads
 EMPTY = -1  # first and last pixel seen by a measurement that sees none: outside every window
 
 
@@ -51,25 +52,44 @@ class Seen:
 
 
 class Back:
-    """A sum of H^T g over parts: those that add pixels, and those that add Fourier coefficients."""
+    """A sum of H^T g over parts: those that add pixels, lines of them, and those that add Fourier coefficients."""
 
     def __init__(self, shape: tuple[int, int], padded: tuple[int, int]) -> None:
         """Begin with 0."""
         self.shape, self.padded = shape, padded
+        self._image: FloatArray | None = None
         self._spectrum: ComplexArray | None = None
-
-    @cached_property
-    def image(self) -> FloatArray:
-        """The sum of what is added in pixels: (rows, columns)."""
-        return np.zeros(self.shape)
+        self._lines: list[tuple[sparse.csc_array, FloatArray]] = []
 
     def add(self, other: Back) -> None:
-        """Add another sum of Fourier coefficients alone."""
+        """Add another sum, which is not needed any more."""
+        other.spread_lines()
+        if other._image is not None:
+            self.add_image(other._image)
         if other._spectrum is not None:
             self.add_spectrum(other._spectrum)
 
+    def add_lines(self, rows: sparse.csc_array, lines: FloatArray) -> None:
+        """Add rows @ lines; rows : (rows of f, k), lines : (k, columns of f)."""
+        self._lines.append((rows, lines))
+
+    def spread_lines(self) -> None:
+        """Add all lines to the image at once, which writes each of its pixels once."""
+        if self._lines:
+            rows, parts = zip(*self._lines, strict=True)
+            self._lines, lines = [], np.empty((sum(map(len, parts)), self.shape[1]))
+            np.concatenate(parts, out=lines)  # by rows, as SciPy takes them, whatever the order of the parts
+            self.add_image(np.asarray(sparse.hstack(rows, format="csc") @ lines))
+
+    def add_image(self, image: FloatArray) -> None:
+        """Add an image, (rows, columns), which is not needed any more."""
+        if self._image is None:
+            self._image = image
+        else:
+            self._image += image
+
     def add_spectrum(self, spectrum: ComplexArray) -> None:
-        """Add the coefficients of an image on the padded grid."""
+        """Add the coefficients of an image on the padded grid, which are not needed any more."""
         if self._spectrum is None:
             self._spectrum = spectrum
         else:
@@ -79,10 +99,11 @@ class Back:
     def total(self) -> FloatArray:
         """The sum: (rows, columns)."""
         if self._spectrum is not None:
-            whole = fft.irfft2(self._spectrum, self.padded, workers=processors(), overwrite_x=True)
-            self.image += np.asarray(whole)[: self.image.shape[0], : self.image.shape[1]]
+            whole = np.asarray(fft.irfft2(self._spectrum, self.padded, workers=processors(), overwrite_x=True))
+            self.add_image(np.ascontiguousarray(whole[: self.shape[0], : self.shape[1]]))
             self._spectrum = None
-        return self.image
+        self.spread_lines()
+        return np.zeros(self.shape) if self._image is None else self._image
 
 
 class ObservationPart(ABC):
@@ -115,7 +136,7 @@ class ObservationPart(ABC):
 
     @property
     def is_slow(self) -> bool:
-        """True if it takes many transforms of its own, and adds nothing but coefficients to a sum."""
+        """True if its work is worth a thread of its own, and shares no transform with that of other parts."""
         return False
 
     @property
@@ -206,7 +227,7 @@ class Entries(ObservationPart):
 
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (m,)."""
-        back.image += (self.matrix.T @ readings).reshape(self.grid)
+        back.add_image((self.matrix.T @ readings).reshape(self.grid))
 
     def to_sparse(self) -> sparse.csr_array:
         """Return the matrix."""
@@ -282,7 +303,12 @@ class Observation:
         """Return H f: (N,) or (rows, columns) to (M,)."""
         grid = np.ascontiguousarray(image, dtype=np.float64).reshape(self.shape)
         seen, out = Seen(grid, self._padded), np.empty(self.measurements)
-        for _ in self._each(lambda part, place: part.forward(seen, out[place])):
+
+        def observe(group: slice) -> None:
+            for part, place in zip(self.parts[group], self.slices[group], strict=True):
+                part.forward(seen, out[place])
+
+        for _ in self._each(observe):
             pass
         return out
 
@@ -290,23 +316,26 @@ class Observation:
         """Return H^T g: (M,) to (N,)."""
         readings, total = np.ascontiguousarray(measurements, dtype=np.float64), Back(self.shape, self._padded)
 
-        def spread(part: ObservationPart, place: slice) -> Back:
-            back = Back(self.shape, self._padded) if part.is_slow else total
-            part.adjoint(readings[place], back)
+        def spread(group: slice) -> Back:
+            back = Back(self.shape, self._padded)
+            for part, place in zip(self.parts[group], self.slices[group], strict=True):
+                part.adjoint(readings[place], back)
+            back.spread_lines()
             return back
 
         for back in self._each(spread):
-            if back is not total:
-                total.add(back)
+            total.add(back)
         return total.total.ravel()
 
-    def _each(self, work: Callable[[ObservationPart, slice], Value]) -> Iterator[Value]:
-        """Yield the results of the parts, in their order; slow ones are computed side by side."""
-        if len(self.parts) == 1 or not all(part.is_slow for part in self.parts):
-            yield from map(work, self.parts, self.slices)
+    def _each(self, work: Callable[[slice], Value]) -> Iterator[Value]:
+        """Yield the results of groups of parts, in their order; slow ones are computed side by side."""
+        count = min(len(self.parts), GROUPS)
+        if count == 1 or not all(part.is_slow for part in self.parts):
+            yield work(slice(None))
             return
+        edges = np.linspace(0, len(self.parts), count + 1).round().astype(int)
         with ThreadPoolExecutor(processors()) as threads:
-            yield from threads.map(work, self.parts, self.slices)
+            yield from threads.map(work, starmap(slice, pairwise(edges)))
 
     def coarser(self, camera: Camera, detail: int) -> Observation:
         """Return H of images of `detail` times larger pixels, each of which is made of equal ones.

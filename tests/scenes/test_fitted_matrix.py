@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
+from ommatid.scenes import observation as observations
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views
 from ommatid.scenes.fitted.view import (
@@ -28,6 +29,7 @@ from ommatid.scenes.fitted.view import (
     misalignment,
     real_box,
 )
+from ommatid.scenes.optics import boxes
 from ommatid.scenes.optics.footprints import sub_matrix
 from ommatid.scenes.pose import Misalignment, pose_of
 
@@ -74,6 +76,22 @@ def test_displaced_boxes_are_exact_areas(row: float, column: float, magnificatio
         box = real_box(cam.shape, sub, numbers)
         product = sparse.kron(box.down.shares, box.across.shares, format="csr")
         assert abs(sparse.csr_array(product) - entries(cam, sub, numbers)).max() < 1e-9
+
+
+def test_its_last_digits_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    cam, rng = camera((70, 61), ODD), np.random.default_rng(0)
+    fitted = with_numbers(cam, np.array([0.3, -1.7, 0.01, 0.0, 0.0]))
+    f, g, found = rng.normal(size=cam.unknowns), rng.normal(size=cam.measurements), set[bytes]()
+    monkeypatch.setattr(boxes, "SLOW", 0)
+    for count in (1, 2, 5):
+        monkeypatch.setattr(observations, "processors", lambda count=count: count)
+        assert fitted.observation is not None
+        found.add(fitted.observation.forward(f).tobytes() + fitted.observation.adjoint(g).tobytes())
+    assert len(found) == 1
+    stored = fitted.to_sparse()
+    assert fitted.observation is not None
+    np.testing.assert_allclose(fitted.observation.forward(f), stored @ f, atol=1e-12)
+    np.testing.assert_allclose(fitted.observation.adjoint(g), stored.T @ g, atol=1e-12)
 
 
 def test_it_is_applied_without_entries_as_with_them() -> None:

@@ -156,14 +156,18 @@ class Bands:
         values, vectors = np.linalg.eigh(inner * roots[:, None] * roots)
         return np.maximum(values, 0.0), roots[:, None] * vectors
 
-    def solve(self, image: FloatArray) -> FloatArray:
-        """Return approximately K^-1 r, (F rows, F columns): symmetric, as conjugate gradients need."""
-        scaled = image / self.scale
-        waves = np.asarray(fft.dctn(scaled, 2, norm="ortho", workers=processors()))
+    def solve(self, image: FloatArray, waves: FloatArray | None = None) -> FloatArray:
+        """Return approximately K^-1 r, (F rows, F columns): symmetric, as conjugate gradients need.
+
+        waves : of r under the DCT-II; None: they are computed
+        """
+        scaled = image if isinstance(self.scale, float) else image / self.scale
+        if waves is None or scaled is not image:
+            waves = np.asarray(fft.dctn(scaled, 2, norm="ortho", workers=processors()))
         if self.detail == 1:
-            waves *= self._single
+            waves = waves * self._single
         else:
-            waves *= self.spectrum
+            waves = waves * self.spectrum
             self._subtract_seen(waves)
         solved: FloatArray = np.asarray(fft.idctn(waves, 2, norm="ortho", workers=processors(), overwrite_x=True))
         for strip in self._strips:
@@ -171,7 +175,7 @@ class Bands:
         for rows, columns, excess in self._corners:
             near = scaled[rows, columns]
             solved[rows, columns] += (excess @ near.ravel()).reshape(near.shape)
-        return solved / self.scale
+        return solved if scaled is image else solved / self.scale
 
     @cached_property
     def _single(self) -> FloatArray:

@@ -55,8 +55,8 @@ LEAST_LOCAL = 1e-3  # of the weights of a pixel's measurements, relative to thei
 class Preconditioner(Protocol):
     """An approximation of C."""
 
-    def solve(self, image: FloatArray) -> FloatArray:
-        """Return about C b: (rows, columns) to (rows, columns)."""
+    def solve(self, image: FloatArray, waves: FloatArray | None = None) -> FloatArray:
+        """Return about C b: (rows, columns) to (rows, columns); waves : those of b where they are known."""
         ...
 
 
@@ -159,10 +159,10 @@ class FrameSystem:
         right : (N,) b
         """
         image, lanczos, bound = np.zeros_like(right), _Lanczos(), np.inf
-        least = reduction * self._bound(right)
+        least = reduction * self._bound(self._waves(right))
         with one_thread():
-            for residual in self._residuals(image, right.copy(), lanczos):
-                bound = self._bound(residual)
+            for waves in self._residuals(image, right.copy(), lanczos):
+                bound = self._bound(waves)
                 if bound <= least or lanczos.count >= most:
                     break
         return image, bound
@@ -186,12 +186,13 @@ class FrameSystem:
             for _ in range(MAX_STARTS):
                 image, lanczos = self._iterated(image, residual, accuracy, lanczos, progress)
                 residual = right - self.apply(image)  # the recursive residual excludes rounding errors
-                bound = self._bound(residual)
+                bound = self._bound(self._waves(residual))
                 if bound <= accuracy:
                     break
             else:
                 # The residual is rounding error, for which the bound by the prior alone is too pessimistic.
-                bound = (max(float(residual @ self._precondition(residual)), 0.0) / (SAFETY * lanczos.least)) ** 0.5
+                energy = float(residual @ self._precondition(residual, self._waves(residual)))
+                bound = (max(energy, 0.0) / (SAFETY * lanczos.least)) ** 0.5
             if bound > accuracy:
                 raise NotReachedError(self._not_reached(bound, lanczos.count, accuracy))
         return Solution(image, lanczos.count, bound, lanczos.largest / lanczos.least if lanczos.count else 1.0)
@@ -217,10 +218,11 @@ class FrameSystem:
         self, start: FloatArray, start_residual: FloatArray, accuracy: float, before: _Lanczos, progress: Progress
     ) -> tuple[FloatArray, _Lanczos]:
         """Run conjugate gradients from `start` until the recursive residual meets the bound."""
-        image, lanczos, first = start.copy(), _Lanczos(), self._bound(start_residual)
+        image, lanczos, first = start.copy(), _Lanczos(), 0.0
         most = MOST_OUTER if isinstance(self.similar, Refined) else MAX_STEPS
-        for residual in self._residuals(image, start_residual.copy(), lanczos):
-            bound = self._bound(residual)
+        for waves in self._residuals(image, start_residual.copy(), lanczos):
+            bound = self._bound(waves)
+            first = bound if not lanczos.count else first
             if lanczos.count:
                 progress(min(1.0, float(np.log(first / bound) / np.log(first / accuracy)) if bound > 0 else 1.0))
             if bound <= accuracy:
@@ -230,7 +232,7 @@ class FrameSystem:
         return image, lanczos if lanczos.count else before
 
     def _residuals(self, image: FloatArray, residual: FloatArray, lanczos: _Lanczos) -> Iterator[FloatArray]:
-        """Yield the residual before each step of conjugate gradients, which change `image` and `residual`.
+        """Yield the waves of the residual before each step of conjugate gradients, which change both arguments.
 
         Where P is itself an iteration, no fixed matrix, the new direction is conjugate to the last one all the same
         (Notay 2000, Eq. 4).
@@ -238,8 +240,9 @@ class FrameSystem:
         direction, energy = None, 1.0
         before = np.empty_like(residual) if isinstance(self.similar, Refined) else None
         while True:
-            yield residual
-            conditioned = self._precondition(residual)
+            waves = self._waves(residual)
+            yield waves
+            conditioned = self._precondition(residual, waves)
             previous, energy = energy, float(residual @ conditioned)
             change = energy if before is None else energy - float(before @ conditioned)
             if not energy > 0:
@@ -268,16 +271,22 @@ class FrameSystem:
             f" {accuracy:g}; {other}, or raise estimator.accuracy"
         )
 
-    def _bound(self, residual: FloatArray) -> float:
-        """Upper bound on sqrt(r^T K^-1 r): sqrt(r^T P0 r)."""
+    def _waves(self, residual: FloatArray) -> FloatArray:
+        """Return a residual under the DCT-II, (rows, columns), or itself where pixels are independent in the prior."""
+        image = residual.reshape(self.shape)
         if isinstance(self.prior, float):
-            return (float(residual @ residual) / self.prior) ** 0.5
-        waves = np.asarray(fft.dctn(residual.reshape(self.shape), 2, norm="ortho", workers=processors()))
+            return image
+        return np.asarray(fft.dctn(image, 2, norm="ortho", workers=processors()))
+
+    def _bound(self, waves: FloatArray) -> float:
+        """Upper bound on sqrt(r^T K^-1 r) for the waves of r: sqrt(r^T P0 r)."""
         return float(np.sum(np.square(waves) / self.prior)) ** 0.5
 
-    def _precondition(self, image: FloatArray) -> FloatArray:
-        preconditioner = self.preconditioner
-        return image if preconditioner is None else preconditioner.solve(image.reshape(self.shape)).ravel()
+    def _precondition(self, residual: FloatArray, waves: FloatArray) -> FloatArray:
+        preconditioner, image = self.preconditioner, residual.reshape(self.shape)
+        if preconditioner is None:
+            return residual
+        return preconditioner.solve(image, None if isinstance(self.prior, float) else waves).ravel()
 
 
 @dataclass(frozen=True)
@@ -292,8 +301,9 @@ class Refined:
         cheaper = system.observation.cheaper
         return similar if cheaper is system.observation else cls(replace(system, observation=cheaper, similar=similar))
 
-    def solve(self, image: FloatArray) -> FloatArray:
+    def solve(self, image: FloatArray, waves: FloatArray | None = None) -> FloatArray:
         """Return about C b: (rows, columns) to (rows, columns)."""
+        del waves
         return self.system.steps(image.ravel(), MOST_INNER, REDUCTION)[0].reshape(image.shape)
 
 
@@ -389,8 +399,9 @@ class BandedFactor:
         band[row - column, column] = values
         return np.asarray(linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False))
 
-    def solve(self, image: FloatArray) -> FloatArray:
+    def solve(self, image: FloatArray, waves: FloatArray | None = None) -> FloatArray:
         """Return C b: (rows, columns) to (rows, columns)."""
+        del waves
         solved = np.empty(image.size)
         solved[self._order] = linalg.cho_solve_banded((self._factor, True), image.ravel()[self._order])
         return solved.reshape(image.shape)

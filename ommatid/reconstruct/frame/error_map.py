@@ -27,7 +27,7 @@ from .conjugate_gradients import BandedFactor, FrameSystem, NotReachedError, lea
 from .reading_space import ReadingSpace
 from .swept import swept_maps
 from .variance_map import VarianceMap, frame_map, is_narrow, is_uneven, unseen_corners, ways_to_edges
-from .windows import HALOS, Windows, by_windows, of_mean_kernels, varies_over_field, windows_map
+from .windows import HALOS, Windows, by_windows, of_mean_kernels, shortest_halo, varies_over_field, windows_map
 
 Pixels = NDArray[np.intp]
 
@@ -196,7 +196,11 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
         maps = frame_map(task, system, system.bands, actual, "edges")
         yield by_windows(maps, task, applied, actual)
         return
-    for halo in HALOS if few and not narrow else HALOS[:1]:
+    halos = HALOS[:1]
+    if few and not narrow:
+        shortest = shortest_halo(task, system.weights, system.bands, actual, ROUGH / 2)
+        halos = HALOS[HALOS.index(shortest) :]
+    for halo in halos:
         yield windows_map(task, system.weights, system.bands, actual, halo)
 
 

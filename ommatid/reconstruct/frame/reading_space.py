@@ -64,8 +64,9 @@ class ReadingSpace:
         lost = np.finfo(float).eps * largest * np.square(gain).sum(axis=0)
         return float(np.divide(lost, posterior, out=np.ones_like(lost), where=posterior > 0).max())
 
-    def solve(self, image: FloatArray) -> FloatArray:
+    def solve(self, image: FloatArray, waves: FloatArray | None = None) -> FloatArray:
         """Return C b: (rows, columns) to (rows, columns)."""
+        del waves
         spread = self._of_prior(image)
         back = self.system.observation.adjoint(self.task.on_all_measurements(self._weights(spread), 0.0))
         return spread - self._of_prior(back.reshape(image.shape))

@@ -21,7 +21,7 @@ from scipy import fft
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.machine import one_thread, processors
 from ommatid.scenes.fitted.kernels import KernelFootprints
-from ommatid.scenes.observation import Entries, Observation
+from ommatid.scenes.observation import Entries, Observation, ObservationPart
 
 from ..methods.method import EstimationTask
 from .bands import Bands
@@ -40,7 +40,7 @@ from .variance_map import (
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
 HALOS = 8, 12, 16  # pixels of f around it, of which a longer one takes several times as long
-MOST_ENTRIES = 30_000_000  # of H of a part, of which windows are then cut out of a matrix
+MOST_ENTRIES = 40_000_000  # of H of a lens type, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
 SIDE, FINE_SIDE = 28, 20  # pixels of f of a window that compares a camera with a map; with a camera, and a finer world
 RIM = 0.3  # of such a window that lies beside its core, on either side
@@ -49,7 +49,7 @@ Core = tuple[slice, ...]
 WHOLE = slice(None), slice(None)
 REPEATS = 5  # windows with the same footprints, from which one and how the others differ are faster than all
 PLACES = 6  # digits of places of readings, in pixels of f, beyond which they are rounded otherwise everywhere
-MOVED = 0.05  # change of a variance by other noise up to which it is known to a hundredth
+MOVED = 0.1  # change of a variance by other noise up to which it is known to a hundredth
 VARYING = 0.05  # variation of kernels from which windows count it; one of 0.09 makes a map 11 % wrong
 
 
@@ -95,7 +95,7 @@ class Response:
         np.multiply(actual - expected, np.square(weights * shrunk), out=excess, where=weights > 0)
         by_squares = np.array([-change, np.square(change) * self.prior_leverage, excess], dtype=np.float32)
         more, own, noisier = (by_squares @ self.squares).reshape(3, *self.posterior.shape)
-        if np.abs(more).max() > MOVED * self.posterior.min():
+        if (np.abs(more) > MOVED * self.posterior).any():
             return None
         posterior = self.posterior + more
         less = 2 * (change.astype(np.float32) @ self.products).reshape(self.posterior.shape)
@@ -160,10 +160,7 @@ class Windows:
 
         Of windows with the same footprints one is solved, from which the others follow where their noise is similar.
         """
-        parts = [
-            part if part.entries > MOST_ENTRIES else Entries(part.to_sparse(), part.shape) for part in observation.parts
-        ]
-        applied, (rows, columns) = Observation(observation.shape, tuple(parts)), self._stretches
+        applied, (rows, columns) = self._as_matrices(observation), self._stretches
         places, alike = list(product(rows, columns)), list(np.ndindex(len(rows), len(columns)))
         if self.task.finer == 1 and not is_narrow(self.task):
             alike = list(product(self._first_alike(observation, 0), self._first_alike(observation, 1)))
@@ -188,6 +185,18 @@ class Windows:
             found = list(threads.map(at, places, alike))
         lines = [found[first : first + len(columns)] for first in range(0, len(found), len(columns))]
         return VarianceMap(*np.block(lines))
+
+    def _as_matrices(self, observation: Observation) -> Observation:
+        """Return H with one matrix for each lens type of not too many entries: many parts are slow to cut."""
+        found: list[ObservationPart] = []
+        for place in self.task.model.camera.type_slices():
+            pairs = zip(observation.parts, observation.slices, strict=True)
+            own = [part for part, each in pairs if place.start <= each.start < place.stop]
+            few = sum(part.entries for part in own) <= MOST_ENTRIES
+            found += (
+                [Entries(Observation(observation.shape, tuple(own)).to_sparse(), observation.shape)] if few else own
+            )
+        return Observation(observation.shape, tuple(found))
 
     @cached_property
     def _noise(self) -> tuple[FloatArray, FloatArray]:
@@ -308,12 +317,33 @@ def windows_map(task: EstimationTask, weights: FloatArray, bands: Bands, actual:
 
     weights : (M,) 1 / Rv;  bands : of a camera like this one;  actual : (measurements used,) noise
     """
+    return _windows(task, weights, bands, actual, halo).frame(task.model.applied)
+
+
+def shortest_halo(task: EstimationTask, weights: FloatArray, bands: Bands, actual: FloatArray, accuracy: float) -> int:
+    """Return the first of HALOS whose window in the middle of the frame is that of the next one to `accuracy`."""
+    cores = list[FloatArray]()
+    for number, halo in enumerate(HALOS):
+        windows = _windows(task, weights, bands, actual, halo)
+        middles = [(size - CORE) // 2 for size in task.shape_of_f]
+        top, left = (
+            min(max(middle - halo, 0), size - side)
+            for middle, size, side in zip(middles, task.shape_of_f, windows.shape, strict=True)
+        )
+        core = slice(middles[0] - top, middles[0] - top + CORE), slice(middles[1] - left, middles[1] - left + CORE)
+        cores.append(windows.map(task.model.applied, (top, left), core)[1:].sum(axis=0))
+        if number and np.abs(cores[-2] / cores[-1] - 1).max() <= accuracy:
+            return HALOS[number - 1]
+    return HALOS[-1]
+
+
+def _windows(task: EstimationTask, weights: FloatArray, bands: Bands, actual: FloatArray, halo: int) -> Windows:
     beside = float(Interior.of(task, bands).variances(1.0, mean_ratios(task, weights, actual))[0])
     core = (CORE, CORE)
     if is_narrow(task):
         widest = max(ceil(each.ratio) for each in task.model.camera.types)
         core, halo = (LENGTH, SWEPT), max(halo, BOXES * widest)
-    return Windows(task, actual, core, halo, beside).frame(task.model.applied)
+    return Windows(task, actual, core, halo, beside)
 
 
 def varies_over_field(observation: Observation) -> bool:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ..camera import Camera
 
 DIGITS = 12  # of shares that count as the same
+SLOW = 100_000  # entries whose products take longer than starting a thread
 
 
 def overlap(ratio: Fraction, pixels: int, start: Fraction, size: int, part: Fraction = Fraction(1)) -> sparse.csr_array:
@@ -86,13 +87,18 @@ class Box(ObservationPart):
         """Largest number of rows or of columns of f that a measurement spans."""
         return max(self.down.width, self.across.width)
 
+    @property
+    def is_slow(self) -> bool:
+        """True of many entries."""
+        return self.entries > SLOW
+
     def forward(self, seen: Seen, out: FloatArray) -> None:
         """Write H f to `out`, (measurements,)."""
         out[:] = self.lens_type.in_order(on_lines(self.down.shares, self.across.shares, seen.image))
 
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements,)."""
-        back.image += self.down.shares.T @ (self.lens_type.by_lines(readings) @ self.across.shares)
+        back.add_lines(self.down.shares.T, self.lens_type.by_lines(readings) @ self.across.shares)
 
     def to_sparse(self) -> sparse.csr_array:
         """Return H as a matrix: (measurements, N)."""

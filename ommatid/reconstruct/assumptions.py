@@ -267,7 +267,7 @@ def _assumptions(
 def _of_rendering(stack: Stack) -> float:
     """Return the relative deviation of the error by rendering from that of its stated variances."""
     samples, passes = (int(stack.record.get(name) or 0) for name in ("samples", "passes"))
-    return max(RENDERING, FEW_SAMPLES * passes / samples) if samples else RENDERING
+    return max(RENDERING, FEW_SAMPLES * min(passes / samples, 1.0)) if samples else RENDERING
 
 
 def _shared_image(method: Method, noise: Noise, image: FloatArray | None) -> FloatArray | None:

@@ -76,10 +76,13 @@ class Back:
     def spread_lines(self) -> None:
         """Add all lines to the image at once, which writes each of its pixels once."""
         if self._lines:
-            rows, parts = zip(*self._lines, strict=True)
-            self._lines, lines = [], np.empty((sum(map(len, parts)), self.shape[1]))
-            np.concatenate(parts, out=lines)  # by rows, as SciPy takes them, whatever the order of the parts
-            self.add_image(np.asarray(sparse.hstack(rows, format="csc") @ lines))
+            (rows, *more), (lines, *others) = zip(*self._lines, strict=True)
+            self._lines = []
+            if more:  # by rows, as SciPy takes them, whatever the order of the parts
+                parts, lines = (lines, *others), np.empty((sum(map(len, (lines, *others))), self.shape[1]))
+                np.concatenate(parts, out=lines)
+                rows = sparse.hstack((rows, *more), format="csc")
+            self.add_image(np.asarray(rows @ lines))
 
     def add_image(self, image: FloatArray) -> None:
         """Add an image, (rows, columns), which is not needed any more."""

@@ -14,7 +14,7 @@ from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
 from ommatid.reconstruct.frame.error_map import ExactVariances, check_map, error_map
 from ommatid.reconstruct.frame.swept import swept_maps
 from ommatid.reconstruct.frame.variance_map import frame_map
-from ommatid.reconstruct.frame.windows import Windows, by_windows, of_mean_kernels, windows_map
+from ommatid.reconstruct.frame.windows import Windows, by_windows, of_mean_kernels, shortest_halo, windows_map
 from ommatid.reconstruct.methods.method import EstimationTask
 from ommatid.reconstruct.prior import reflecting_root
 from ommatid.runtime.arrays import FloatArray
@@ -206,6 +206,20 @@ def test_some_windows_give_the_mean_error_of_another_camera() -> None:
     every = windows_map(task, system.weights, system.bands, task.expected_noise, 8)
     assert found.variance.mean() == pytest.approx(every.variance.mean(), rel=0.02)
     assert like.variance.mean() < 0.93 * every.variance.mean()
+
+
+@pytest.mark.parametrize(("shape", "noise", "expected"), [((60, 47), 1.0, 8), ((10, 60), 1e4, 12)])
+def test_the_halo_is_as_long_as_errors_reach(shape: tuple[int, int], noise: float, expected: int) -> None:
+    """To 1 % of an exact solution in the middle; a shorter one is further off."""
+    odd = (("1/3", [3, 2], "fit"), ("1/4", [4, 4], "fit"), ("1/5", [4, 5], "fit"))
+    task = task_of(wide(shape, odd, **CORRELATED), noise)
+    system, middle = system_of(task), (shape[0] // 2, shape[1] // 2)
+    assert system.bands is not None
+    assert shortest_halo(task, system.weights, system.bands, task.expected_noise, 1e-2) == expected
+    exact = exact_at(task, middle)
+    for halo in (8, 12):
+        found = windows_map(task, system.weights, system.bands, task.expected_noise, halo).variance.reshape(shape)
+        assert (abs(found[middle] / exact - 1) < 1e-2) == (halo >= expected)
 
 
 @pytest.mark.parametrize("as_expected", [pytest.param(True, marks=pytest.mark.slow), False])

@@ -325,7 +325,7 @@ def shortest_halo(task: EstimationTask, weights: FloatArray, bands: Bands, actua
     cores = list[FloatArray]()
     for number, halo in enumerate(HALOS):
         windows = _windows(task, weights, bands, actual, halo)
-        middles = [(size - CORE) // 2 for size in task.shape_of_f]
+        middles = [max((size - CORE) // 2, 0) for size in task.shape_of_f]
         top, left = (
             min(max(middle - halo, 0), size - side)
             for middle, size, side in zip(middles, task.shape_of_f, windows.shape, strict=True)

@@ -63,7 +63,7 @@ class Back:
 
     def add(self, other: Back) -> None:
         """Add another sum, which is not needed any more."""
-        other.spread_lines()
+        self._lines += other._lines
         if other._image is not None:
             self.add_image(other._image)
         if other._spectrum is not None:
@@ -79,8 +79,8 @@ class Back:
             (rows, *more), (lines, *others) = zip(*self._lines, strict=True)
             self._lines = []
             if more:  # by rows, as SciPy takes them, whatever the order of the parts
-                parts, lines = (lines, *others), np.empty((sum(map(len, (lines, *others))), self.shape[1]))
-                np.concatenate(parts, out=lines)
+                parts = lines, *others
+                lines = np.concatenate(parts, out=np.empty((sum(map(len, parts)), self.shape[1])))
                 rows = sparse.hstack((rows, *more), format="csc")
             self.add_image(np.asarray(rows @ lines))
 
@@ -317,7 +317,7 @@ class Observation:
 
     def adjoint(self, measurements: FloatArray) -> FloatArray:
         """Return H^T g: (M,) to (N,)."""
-        readings, total = np.ascontiguousarray(measurements, dtype=np.float64), Back(self.shape, self._padded)
+        readings = np.ascontiguousarray(measurements, dtype=np.float64)
 
         def spread(group: slice) -> Back:
             back = Back(self.shape, self._padded)
@@ -326,7 +326,9 @@ class Observation:
             back.spread_lines()
             return back
 
-        for back in self._each(spread):
+        backs = self._each(spread)
+        total = next(backs)
+        for back in backs:
             total.add(back)
         return total.total.ravel()
 

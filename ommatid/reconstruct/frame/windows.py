@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import ceil
@@ -322,10 +322,10 @@ def windows_map(task: EstimationTask, weights: FloatArray, bands: Bands, actual:
 
 def shortest_halo(task: EstimationTask, weights: FloatArray, bands: Bands, actual: FloatArray, accuracy: float) -> int:
     """Return the first of HALOS whose window in the middle of the frame is that of the next one to `accuracy`."""
-    cores = list[FloatArray]()
+    cores, like = list[FloatArray](), _windows(task, weights, bands, actual, HALOS[0])
+    middles = [max((size - CORE) // 2, 0) for size in task.shape_of_f]
     for number, halo in enumerate(HALOS):
-        windows = _windows(task, weights, bands, actual, halo)
-        middles = [max((size - CORE) // 2, 0) for size in task.shape_of_f]
+        windows = replace(like, halo=halo)
         top, left = (
             min(max(middle - halo, 0), size - side)
             for middle, size, side in zip(middles, task.shape_of_f, windows.shape, strict=True)

@@ -16,7 +16,7 @@ from .frame.conjugate_gradients import band_width, band_work, leaves_null_space,
 from .frame.frame_method import FrameMethod
 from .frame.reading_space import MOST_READINGS, MOST_UNKNOWNS
 from .frame.variance_map import LONG
-from .frame.windows import CORE, HALOS
+from .frame.windows import CORE, LONG_HALO
 from .methods.dense_method import DenseMethod
 from .methods.method import Method
 from .methods.tile_method import TileMethod
@@ -167,7 +167,7 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
     if not correlated and serves(camera):
         band = 8 * camera.unknowns * band_width(camera)
         return PROGRAM_MEMORY + images + entries + 5 * band  # the factor, a copy, and two matrices per block of lines
-    side = LONG if leaves_null_space(camera) else CORE + 2 * HALOS[-1]  # of small frames or windows
+    side = LONG if leaves_null_space(camera) else CORE + 2 * LONG_HALO  # of small frames or windows
     cut_out = 0 if camera.is_sliding else 12 * camera.measurements * (widest + 1) ** 2  # H, of which windows are parts
     return PROGRAM_MEMORY + images + entries + cut_out + 8 * MATRICES * side**4
 

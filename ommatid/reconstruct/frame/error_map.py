@@ -27,7 +27,7 @@ from .conjugate_gradients import BandedFactor, FrameSystem, NotReachedError, lea
 from .reading_space import ReadingSpace
 from .swept import swept_maps
 from .variance_map import VarianceMap, frame_map, is_narrow, is_uneven, unseen_corners, ways_to_edges
-from .windows import HALOS, Windows, by_windows, of_mean_kernels, shortest_halo, varies_over_field, windows_map
+from .windows import HALOS, Windows, by_windows, of_mean_kernels, varies_over_field, windows_map
 
 Pixels = NDArray[np.intp]
 
@@ -45,6 +45,7 @@ EXACT = 1e-3  # relative accuracy of a solution
 MOST_EXACT = 45  # pixels of f along an axis of a frame whose map is exact
 MOST_READINGS = 3600  # of such a frame where the world is finer
 UNCHECKED = 2e-2  # error of the fastest map
+SPREAD = 0.2  # of logarithms of the levels of noise, above which windows start with a longer halo
 ROUGH = 2e-2  # error of a variance at random pixels above which another map is tried
 
 
@@ -196,11 +197,8 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
         maps = frame_map(task, system, system.bands, actual, "edges")
         yield by_windows(maps, task, applied, actual)
         return
-    halos = HALOS[:1]
-    if few and not narrow:
-        shortest = shortest_halo(task, system.weights, system.bands, actual, ROUGH / 2)
-        halos = HALOS[HALOS.index(shortest) :]
-    for halo in halos:
+    halos = HALOS[int(np.log(system.levels(task.of_f)).std() > SPREAD) :]
+    for halo in halos if few and not narrow else halos[:1]:
         yield windows_map(task, system.weights, system.bands, actual, halo)
 
 

@@ -1,6 +1,8 @@
 """The expected error (Eq. 5) of f's pixels from windows of a frame side by side, for any camera and any noise.
 
-Each window has a halo, and its own readings: what these see beside it counts as noise.
+Each window has a halo, and its own readings: what these see beside it counts as noise. Variances are too large by what
+a longer halo would show. That depends on a pixel's place in its core, and hardly on the window: some windows with a
+long halo correct all.
 """
 
 from __future__ import annotations
@@ -39,7 +41,10 @@ from .variance_map import (
 )
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
-HALOS = 8, 12, 16  # pixels of f around it, of which a longer one takes several times as long
+HALOS = 6, 8, 12  # pixels of f around it: where noise is even, where it is not, and where the map is rough
+LONG_HALO = 16  # of the windows that correct all, of whose variances 0.1 % is left, and
+FINE_LONG_HALO = 12  # where the world is finer
+INSIDE = 2  # of these along an axis between those at the edges
 MOST_ENTRIES = 40_000_000  # of H of a lens type, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
 SIDE, FINE_SIDE = 28, 20  # pixels of f of a window that compares a camera with a map; with a camera, and a finer world
@@ -183,8 +188,37 @@ class Windows:
         with one_thread(), ThreadPoolExecutor(processors()) as threads:
             responses = dict(zip(shared, threads.map(response, shared), strict=True))
             found = list(threads.map(at, places, alike))
+            if self.halo < self._longer.halo and not is_narrow(self.task):
+                found = list(map(np.multiply, found, self._by_longer_halo(applied, threads)))
         lines = [found[first : first + len(columns)] for first in range(0, len(found), len(columns))]
         return VarianceMap(*np.block(lines))
+
+    @cached_property
+    def _longer(self) -> Windows:
+        return replace(self, halo=LONG_HALO if self.task.finer == 1 else FINE_LONG_HALO)
+
+    def _by_longer_halo(self, observation: Observation, threads: ThreadPoolExecutor) -> list[FloatArray]:
+        """Return the ratios of maps with a long halo to those of the windows of a frame: (3, rows, columns) of each.
+
+        They are medians over some windows inside the frame, over some at each of its edges, and those in its corners.
+        """
+        longer = self._longer
+        pairs = [list(zip(*each, strict=True)) for each in zip(self._stretches, longer._stretches, strict=True)]
+        chosen = [_by_edges(len(axis)) for axis in pairs]
+
+        def ratio(row: int, column: int) -> FloatArray:
+            own, wide = zip(pairs[0][row], pairs[1][column], strict=True)
+            maps, corrected = (
+                windows.map(observation, (down.first, across.first), (down.core, across.core))
+                for windows, (down, across) in ((self, own), (longer, wide))
+            )
+            return np.divide(corrected, maps, out=np.ones_like(maps), where=maps > 0)
+
+        places = sorted({place for down in chosen[0] for across in chosen[1] for place in product(down, across)})
+        ratios = dict(zip(places, threads.map(ratio, *zip(*places, strict=True)), strict=True))
+        return [
+            np.median([ratios[place] for place in product(down, across)], axis=0) for down, across in product(*chosen)
+        ]
 
     def _as_matrices(self, observation: Observation) -> Observation:
         """Return H with one matrix for each lens type of not too many entries: many parts are slow to cut."""
@@ -320,21 +354,10 @@ def windows_map(task: EstimationTask, weights: FloatArray, bands: Bands, actual:
     return _windows(task, weights, bands, actual, halo).frame(task.model.applied)
 
 
-def shortest_halo(task: EstimationTask, weights: FloatArray, bands: Bands, actual: FloatArray, accuracy: float) -> int:
-    """Return the first of HALOS whose window in the middle of the frame is that of the next one to `accuracy`."""
-    cores, like = list[FloatArray](), _windows(task, weights, bands, actual, HALOS[0])
-    middles = [max((size - CORE) // 2, 0) for size in task.shape_of_f]
-    for number, halo in enumerate(HALOS):
-        windows = replace(like, halo=halo)
-        top, left = (
-            min(max(middle - halo, 0), size - side)
-            for middle, size, side in zip(middles, task.shape_of_f, windows.shape, strict=True)
-        )
-        core = slice(middles[0] - top, middles[0] - top + CORE), slice(middles[1] - left, middles[1] - left + CORE)
-        cores.append(windows.map(task.model.applied, (top, left), core)[1:].sum(axis=0))
-        if number and np.abs(cores[-2] / cores[-1] - 1).max() <= accuracy:
-            return HALOS[number - 1]
-    return HALOS[-1]
+def _by_edges(count: int) -> list[tuple[int, ...]]:
+    """Return, for each of `count` windows along an axis, the numbers of those that stand for it."""
+    inside = tuple(np.linspace(0, count - 1, INSIDE + 2).round().astype(int)[1:-1].tolist())
+    return [(number,) if number in (0, count - 1) else inside for number in range(count)]
 
 
 def _windows(task: EstimationTask, weights: FloatArray, bands: Bands, actual: FloatArray, halo: int) -> Windows:

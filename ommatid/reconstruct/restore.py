@@ -262,17 +262,15 @@ def restore(
     workers: Workers | None = None,
     progress: Progress = no_progress,
     prepared: Prepared | None = None,
-    *,
-    quick: bool = False,
 ) -> Reconstruction:
     """Reconstruct a stack with a model as the stack's scene says (Wood et al., Eq. 4 and Eq. 5).
 
     truth : (N,) or (pixels of the world,), or None;  workers : for tiles, absent: threads of this process
-    prepared : what other frames of this model left, None for a frame by itself;  quick : as of `Execution`
+    prepared : what other frames of this model left, None for a frame by itself
     Raises InputError if memory does not suffice, if no method reaches the tolerance of the scene, or if the noise of a
     [sensor] is to be fitted.
     """
-    execution = Execution(workers, progress, prepared or Prepared(model), quick)
+    execution = Execution(workers, progress, prepared or Prepared(model))
     return with_fallback(stack, model, lambda choice: _restored(stack, model, truth, choice, execution))
 
 

@@ -83,6 +83,7 @@ class FrameMethod(Method):
         super().__init__(task, execution)
         self._banded = task.finer == 1 and task.prior.kind == "independent" and serves(task.model.camera)
         self._start, self._nearly = None, None  # solutions from which those of this method start
+        self._lacking: tuple[FloatArray, FloatArray] | None = None  # the last image of `_hidden`, and its result
         nearby = execution.nearby
         if nearby is not None and nearby.image.size == task.model.unknowns:
             self._start, self._nearly = nearby.image - task.prior.mean, nearby.response
@@ -161,7 +162,8 @@ class FrameMethod(Method):
 
     def operators(self) -> PosteriorOperators:
         """Return the operators of the estimate, to a mean error of a hundredth of a posterior standard deviation."""
-        return posterior_operators(self.system, self.task, self._solve, self._solve_weights)
+        found = posterior_operators(self.system, self.task, self._solve, self._solve_weights)
+        return replace(found, hidden=self._hidden)
 
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
@@ -273,7 +275,7 @@ class FrameMethod(Method):
             return None
         if deviation is None:
             return replace(power, bias=None, noise=None)
-        bias = self._residual_of(deviation)
+        bias = self.task.observe(self._hidden(deviation))  # (I - H A) H f
         np.square(bias, out=bias)
         bias /= self.task.expected_noise
         return replace(power, bias=bias)
@@ -288,6 +290,12 @@ class FrameMethod(Method):
         right = self.system.right_hand_side(task.on_all_measurements(column, 0.0))
         observed = task.observe(self._solve(right))
         return np.subtract(column, observed, out=observed)
+
+    def _hidden(self, deviation: FloatArray) -> FloatArray:
+        """Return C P0^-1 f, what the estimate lacks of an image less its mean: of the true one for several purposes."""
+        if self._lacking is None or not np.array_equal(self._lacking[0], deviation):
+            self._lacking = deviation, self._solve(self.system.apply_prior_precision(deviation))
+        return self._lacking[1]
 
     def _solve(self, right: FloatArray) -> FloatArray:
         """Return C b for a mean over the frame, to a mean error of a hundredth of a posterior standard deviation."""
@@ -346,7 +354,7 @@ class FrameMethod(Method):
         if self.quick_bands is not None:
             lost, variance = self._by_waves(self.quick_bands, deviation, actual, variances)
             return interval(lost + noisy, variance + (map_error * noisy) ** 2, count)
-        bias = task.of_f(self._solve(system.apply_prior_precision(deviation)))
+        bias = task.of_f(self._hidden(deviation))
         along = float(actual @ np.square(self._transposed_gain(task.of_unknowns(bias))))
         rng, squares = probe(Purpose.ERROR_INTERVAL), 0.0
         for _ in range(self._draws):

@@ -45,7 +45,7 @@ EXACT = 1e-3  # relative accuracy of a solution
 MOST_EXACT = 45  # pixels of f along an axis of a frame whose map is exact
 MOST_READINGS = 3600  # of such a frame where the world is finer
 UNCHECKED = 2e-2  # error of the fastest map
-SPREAD = 0.2  # of logarithms of the levels of noise, above which windows start with a longer halo
+SPREAD = 0.2  # of logarithms of the levels of noise, above which windows start with a longer halo, as behind blur
 ROUGH = 2e-2  # error of a variance at random pixels above which another map is tried
 
 
@@ -197,7 +197,8 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
         maps = frame_map(task, system, system.bands, actual, "edges")
         yield by_windows(maps, task, applied, actual)
         return
-    halos = HALOS[int(np.log(system.levels(task.of_f)).std() > SPREAD) :]
+    far = not task.model.camera.has_sharp_footprints or np.log(system.levels(task.of_f)).std() > SPREAD
+    halos = HALOS[int(far) :]
     for halo in halos if few and not narrow else halos[:1]:
         yield windows_map(task, system.weights, system.bands, actual, halo)
 

@@ -42,9 +42,12 @@ from .variance_map import (
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
 HALOS = 6, 8, 12  # pixels of f around it: where noise is even, where it is not, and where the map is rough
-LONG_HALO = 16  # of the windows that correct all, of whose variances 0.1 % is left, and
-FINE_LONG_HALO = 12  # where the world is finer
-INSIDE = 2  # of these along an axis between those at the edges
+LONG_HALO, MEDIUM_HALO = (
+    16,
+    12,
+)  # of the windows that correct all; the shorter one where these would be much of the work:
+FEW = 200  # windows of a frame, or a finer world
+INSIDE = 2, 1  # windows that correct all, along an axis between those at the edges
 MOST_ENTRIES = 40_000_000  # of H of a lens type, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
 SIDE, FINE_SIDE = 28, 20  # pixels of f of a window that compares a camera with a map; with a camera, and a finer world
@@ -195,7 +198,12 @@ class Windows:
 
     @cached_property
     def _longer(self) -> Windows:
-        return replace(self, halo=LONG_HALO if self.task.finer == 1 else FINE_LONG_HALO)
+        return replace(self, halo=MEDIUM_HALO if self._is_small else LONG_HALO)
+
+    @property
+    def _is_small(self) -> bool:
+        rows, columns = self._stretches
+        return self.task.finer > 1 or len(rows) * len(columns) < FEW
 
     def _by_longer_halo(self, observation: Observation, threads: ThreadPoolExecutor) -> list[FloatArray]:
         """Return the ratios of maps with a long halo to those of the windows of a frame: (3, rows, columns) of each.
@@ -204,7 +212,7 @@ class Windows:
         """
         longer = self._longer
         pairs = [list(zip(*each, strict=True)) for each in zip(self._stretches, longer._stretches, strict=True)]
-        chosen = [_by_edges(len(axis)) for axis in pairs]
+        chosen = [_by_edges(len(axis), INSIDE[self._is_small]) for axis in pairs]
 
         def ratio(row: int, column: int) -> FloatArray:
             own, wide = zip(pairs[0][row], pairs[1][column], strict=True)
@@ -354,9 +362,9 @@ def windows_map(task: EstimationTask, weights: FloatArray, bands: Bands, actual:
     return _windows(task, weights, bands, actual, halo).frame(task.model.applied)
 
 
-def _by_edges(count: int) -> list[tuple[int, ...]]:
-    """Return, for each of `count` windows along an axis, the numbers of those that stand for it."""
-    inside = tuple(np.linspace(0, count - 1, INSIDE + 2).round().astype(int)[1:-1].tolist())
+def _by_edges(count: int, most: int) -> list[tuple[int, ...]]:
+    """Return, for each of `count` windows along an axis, the numbers of those that stand for it: at most so many."""
+    inside = tuple(np.linspace(0, count - 1, most + 2).round().astype(int)[1:-1].tolist())
     return [(number,) if number in (0, count - 1) else inside for number in range(count)]
 
 

@@ -42,12 +42,9 @@ from .variance_map import (
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
 HALOS = 6, 8, 12  # pixels of f around it: where noise is even, where it is not, and where the map is rough
-LONG_HALO, MEDIUM_HALO = (
-    16,
-    12,
-)  # of the windows that correct all; the shorter one where these would be much of the work:
-FEW = 200  # windows of a frame, or a finer world
-INSIDE = 2, 1  # windows that correct all, along an axis between those at the edges
+LONG_HALO, MEDIUM_HALO = 16, 12  # of windows that correct all, and where these would be much of the work: in frames of
+FEW = 200  # windows, and where the world is finer
+INSIDE = 2, 1  # windows that correct all, along an axis between those at the edges, and there
 MOST_ENTRIES = 40_000_000  # of H of a lens type, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
 SIDE, FINE_SIDE = 28, 20  # pixels of f of a window that compares a camera with a map; with a camera, and a finer world
@@ -198,10 +195,12 @@ class Windows:
 
     @cached_property
     def _longer(self) -> Windows:
+        """The windows with a long halo."""
         return replace(self, halo=MEDIUM_HALO if self._is_small else LONG_HALO)
 
     @property
     def _is_small(self) -> bool:
+        """True where a few windows with a long halo would be much of the work."""
         rows, columns = self._stretches
         return self.task.finer > 1 or len(rows) * len(columns) < FEW
 

@@ -41,7 +41,7 @@ from .variance_map import (
 )
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
-HALOS = 6, 8, 12  # pixels of f around it: where noise is even, where it is not, and where the map is rough
+HALOS = 6, 8, 12, 16  # pixels of f around it: where noise is even, where it is not, and where the map is rough
 LONG_HALO, MEDIUM_HALO = 16, 12  # of windows that correct all, and where these would be much of the work: in frames of
 FEW = 200  # windows, and where the world is finer
 INSIDE = 2, 1  # windows that correct all, along an axis between those at the edges, and there

@@ -143,7 +143,8 @@ def assumptions_at(
 ) -> Assumptions:
     """Collect the noise of a known image, (N,) or (pixels of the world,), and the method for a known prior.
 
-    Use it for predictions. A quick method is given readings of the prior's mean, of which there is nothing to solve.
+    Use it for predictions and the goal of a calibration. A quick method is given readings of the prior's mean, of which
+    there is nothing to solve.
     """
     usable, prior = usable_pixels(stack, model), stack.scene.assumed_prior
     of_image = model_of_f(model, stack.camera, prior)

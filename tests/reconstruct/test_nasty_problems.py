@@ -75,6 +75,18 @@ def test_contradictions_are_relative_to_the_image(mean: float) -> None:
     assert estimate(problem, np.array([1.5, 1.5])).image == pytest.approx([1.5], abs=1e-15 * max(mean, 1.5))
 
 
+def test_measurements_are_refused_that_may_contradict_one_another_or_determine_the_image() -> None:
+    """Two rows without noise that differ by their rounding, and a root of a known mean whose rows add up to 7e-15.
+
+    In exact numbers they determine the mean, far from what the prior says, by a signal of 1e-30.
+    """
+    row = np.array([0.6270104608342295, 0.7383332573230119, 0.6146593538497589])
+    prior = Prior(np.full(3, 127.5), 73.9 * (np.eye(3) - 1 / 3))
+    problem = Problem(sparse.csr_array(np.stack([row, row + 4 * 2.0**-53])), prior, np.zeros(2))
+    with pytest.raises(InputError, match="no form of the estimator"):
+        estimate(problem, np.array([265.1198415482231, 265.1198415482233]))
+
+
 @pytest.mark.parametrize("noise", [1e-6, 1e-20, 1e-30])
 def test_error_bars_keep_their_digits(noise: float) -> None:
     """80 pixels, each seen by its own measurement: variance and bias of a sum in closed form."""

@@ -216,8 +216,19 @@ class _Certifier:
         misfit, error = np.abs(residuals[1]), rounding[1]
         ratio = np.divide(misfit, error, out=np.zeros_like(misfit), where=noise_free & (error > 0))
         ratio = ratio.max(axis=0, initial=0.0)
-        ratio = np.where(ratio > ROUNDING_MARGIN, np.maximum(ratio, EPS / self.system.rounding), 1.0)
-        return rounding[0], ratio * error
+        least = np.inf if self._hides_dependence else EPS / self.system.rounding
+        ratio = np.where(ratio > ROUNDING_MARGIN, np.maximum(ratio, least), 1.0)
+        return rounding[0], np.multiply(ratio, error, out=np.zeros_like(error), where=error > 0)
+
+    @property
+    def _hides_dependence(self) -> bool:
+        """True of a root that is dense and counts as exact.
+
+        Through its own rounding, rows that differ by theirs differ by the square of that: by less than double-double
+        shows. Whether such rows contradict one another or determine the image then remains unknown.
+        """
+        prior = self.system.problem.prior
+        return not prior.independent and not prior.rounding
 
     def quadratic_form(self, u: DoubleDouble, multipliers: DoubleDouble) -> tuple[FloatArray, FloatArray]:
         """Return c u + u p - l q and a bound on its distance from c u of the exact u: (q,) each, for r = 0."""

@@ -141,7 +141,7 @@ class Execution:
 
     nearby : solutions for nearly the same noise, None where there are none
     quick : True takes a frame's error from transfer functions alone, those of the mean camera, and no residual's: for
-        predictions, and where the error is compared with that of another model
+        predictions, and for what errors of H add to the error
     """
 
     workers: Workers | None = None

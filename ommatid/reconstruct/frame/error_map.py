@@ -27,7 +27,7 @@ from .conjugate_gradients import BandedFactor, FrameSystem, NotReachedError, lea
 from .reading_space import ReadingSpace
 from .swept import swept_maps
 from .variance_map import VarianceMap, frame_map, is_narrow, is_uneven, unseen_corners, ways_to_edges
-from .windows import HALOS, Windows, by_windows, of_mean_kernels, varies_over_field, windows_map
+from .windows import HALOS, Windows, by_windows, has_few_windows, of_mean_kernels, varies_over_field, windows_map
 
 Pixels = NDArray[np.intp]
 
@@ -197,7 +197,8 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
         maps = frame_map(task, system, system.bands, actual, "edges")
         yield by_windows(maps, task, applied, actual)
         return
-    far = not task.model.camera.has_sharp_footprints or np.log(system.levels(task.of_f)).std() > SPREAD
+    far = has_few_windows(task) or not task.model.camera.has_sharp_footprints
+    far = far or np.log(system.levels(task.of_f)).std() > SPREAD
     halos = HALOS[int(far) :]
     for halo in halos if few and not narrow else halos[:1]:
         yield windows_map(task, system.weights, system.bands, actual, halo)

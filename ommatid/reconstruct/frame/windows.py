@@ -41,7 +41,7 @@ from .variance_map import (
 )
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
-HALOS = 6, 8, 12, 16  # pixels of f around it: where noise is even, where it is not, and where the map is rough
+HALOS = 6, 8, 12, 16  # pixels of f around it: of many with even noise, of others, and where the map is rough
 LONG_HALO, MEDIUM_HALO = 16, 12  # of windows that correct all, and where these would be much of the work: in frames of
 FEW = 200  # windows, and where the world is finer
 INSIDE = 2, 1  # windows that correct all, along an axis between those at the edges, and there
@@ -196,13 +196,7 @@ class Windows:
     @cached_property
     def _longer(self) -> Windows:
         """The windows with a long halo."""
-        return replace(self, halo=MEDIUM_HALO if self._is_small else LONG_HALO)
-
-    @property
-    def _is_small(self) -> bool:
-        """True where a few windows with a long halo would be much of the work."""
-        rows, columns = self._stretches
-        return self.task.finer > 1 or len(rows) * len(columns) < FEW
+        return replace(self, halo=MEDIUM_HALO if has_few_windows(self.task) else LONG_HALO)
 
     def _by_longer_halo(self, observation: Observation, threads: ThreadPoolExecutor) -> list[FloatArray]:
         """Return the ratios of maps with a long halo to those of the windows of a frame: (3, rows, columns) of each.
@@ -211,7 +205,7 @@ class Windows:
         """
         longer = self._longer
         pairs = [list(zip(*each, strict=True)) for each in zip(self._stretches, longer._stretches, strict=True)]
-        chosen = [_by_edges(len(axis), INSIDE[self._is_small]) for axis in pairs]
+        chosen = [_by_edges(len(axis), INSIDE[has_few_windows(self.task)]) for axis in pairs]
 
         def ratio(row: int, column: int) -> FloatArray:
             own, wide = zip(pairs[0][row], pairs[1][column], strict=True)
@@ -359,6 +353,12 @@ def windows_map(task: EstimationTask, weights: FloatArray, bands: Bands, actual:
     weights : (M,) 1 / Rv;  bands : of a camera like this one;  actual : (measurements used,) noise
     """
     return _windows(task, weights, bands, actual, halo).frame(task.model.applied)
+
+
+def has_few_windows(task: EstimationTask) -> bool:
+    """Return True where a few windows with a long halo would be much of the work."""
+    rows, columns = (ceil(size / CORE) for size in task.shape_of_f)
+    return task.finer > 1 or rows * columns < FEW
 
 
 def _by_edges(count: int, most: int) -> list[tuple[int, ...]]:

@@ -227,7 +227,7 @@ class Windows:
         for place in self.task.model.camera.type_slices():
             pairs = zip(observation.parts, observation.slices, strict=True)
             own = [part for part, each in pairs if place.start <= each.start < place.stop]
-            few = sum(part.entries for part in own) <= MOST_ENTRIES
+            few = 0 < sum(part.entries for part in own) <= MOST_ENTRIES  # none where one part holds several types
             found += (
                 [Entries(Observation(observation.shape, tuple(own)).to_sparse(), observation.shape)] if few else own
             )

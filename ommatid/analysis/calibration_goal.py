@@ -43,7 +43,7 @@ def for_stack(stack: Stack) -> StoppingRule:
     known = _with_known_prior(stack)
     made_from = ["stack", digest(stack.values, stack.variance), _tables(stack.scene)]
     return StoppingRule(
-        lambda model: added_error(known, model, None), fingerprint(made_from), "the expected error of this stack"
+        lambda model: _added_error(known, model, None), fingerprint(made_from), "the expected error of this stack"
     )
 
 
@@ -65,12 +65,12 @@ def for_prior(setup: Setup) -> StoppingRule:
         mean, deviation = scene.prior.mean, scene.prior.variance**0.5
         light = model.forward(np.full(model.unknowns, mean))
         stack = _with_known_prior(exposed(setup, light, np.zeros(camera.measurements), {}))
-        return added_error(stack, model, mean + deviation * probe(Purpose.GOAL).normal(size=model.unknowns))
+        return _added_error(stack, model, mean + deviation * probe(Purpose.GOAL).normal(size=model.unknowns))
 
     return StoppingRule(added, fingerprint(["prior", _tables(scene)]), "Eq. 5 for images drawn from the prior")
 
 
-def added_error(stack: Stack, model: Model, image: FloatArray | None) -> float:
+def _added_error(stack: Stack, model: Model, image: FloatArray | None) -> float:
     """Return the error that the uncertainty of H adds, relative to all other error.
 
     stack : its prior is known;  image : (unknowns,) on which errors of H act; None: a first estimate

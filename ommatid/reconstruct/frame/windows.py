@@ -42,9 +42,9 @@ from .variance_map import (
 
 CORE = 12  # pixels of f along a side of the core whose variances a window gives
 HALOS = 6, 8, 12, 16  # pixels of f around it: of many with even noise, of others, and where the map is rough
-LONG_HALO, MEDIUM_HALO = 16, 12  # of windows that correct all, and where these would be much of the work: in frames of
-FEW = 200  # windows, and where the world is finer
-INSIDE = 2, 1  # windows that correct all, along an axis between those at the edges, and there
+FEW = 200  # windows of a frame, below which the work of those that correct them counts
+LONG_HALO, MEDIUM_HALO = 16, 12  # of windows that correct all others; where these are few, or the world is finer
+INSIDE = 2, 1  # windows that correct all others, along an axis between those at the edges; likewise
 MOST_ENTRIES = 40_000_000  # of H of a lens type, of which windows are then cut out of a matrix
 SWEPT, LENGTH, BOXES = 24, 216, 4  # the same where pixels are independent: core, its other side, and halo in boxes
 SIDE, FINE_SIDE = 28, 20  # pixels of f of a window that compares a camera with a map; with a camera, and a finer world

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import sparse, stats
 
+from ommatid.reconstruct.estimator.estimate import estimate
 from ommatid.reconstruct.prior import Prior, independent
 from ommatid.reconstruct.problem import Form, Problem
 from ommatid.runtime.arrays import FloatArray
@@ -109,6 +110,11 @@ def tile_problem(lens_types: int, noise: float) -> Problem:
     """The problem of a 19 x 19 tile with up to three lens types and the paper's prior."""
     tile = camera(lenses=THREE[:lens_types])
     return Problem(ideal_matrix(tile), independent(127.5, 5461.25, 361), np.full(tile.measurements, noise))
+
+
+def form_of(problem: Problem) -> Form:
+    """The form that estimates an image equal to f0, whose posterior variances are accurate to the tolerance."""
+    return estimate(problem, problem.matrix @ problem.prior.mean).form
 
 
 OPTICS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # for `with_optics`

@@ -10,7 +10,6 @@ import pytest
 
 from ommatid.analysis.predict import predict_scene
 from ommatid.analysis.run_prediction import predict_run
-from ommatid.reconstruct.estimator.estimate import factorise
 from ommatid.reconstruct.misalignment.moments import misaligned_moments, mismatch_variance
 from ommatid.reconstruct.prior import independent, prior_of
 from ommatid.reconstruct.problem import Problem
@@ -24,7 +23,7 @@ from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.ideal import ideal_matrix, ideal_model, true_matrix
 from ommatid.simulate.render import exposed
 
-from ..examples import Lenses, needs, scene
+from ..examples import Lenses, form_of, needs, scene
 
 ACTUAL, NOISE = 5461.25, 4.0
 LENSES: Lenses = (("1/2", [2, 2], "fit"), ("1/3", [3, 3], "fit"))
@@ -129,7 +128,7 @@ def test_the_cost_of_misalignment_is_that_of_images_with_the_actual_variance() -
     camera = replace(derive(described(50.0)), tolerance=tolerance(0))
     assumed, actual = (independent(127.5, variance, 144) for variance in (50.0, ACTUAL))
     matrix = ideal_matrix(camera)
-    form, _ = factorise(Problem(matrix, assumed, np.full(camera.measurements, NOISE)))
+    form = form_of(Problem(matrix, assumed, np.full(camera.measurements, NOISE)))
     used, moments = np.ones(camera.measurements, dtype=np.bool_), misaligned_moments(camera, actual)
     added = float(mismatch_variance(form, used, moments, camera.slices(), actual).mean())
     rng, differences = np.random.default_rng(0), []

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from ommatid.reconstruct.estimator.certificate import variance_error
-from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, estimate, factorise
+from ommatid.reconstruct.estimator.estimate import FORMS, TOLERANCE, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
 from ommatid.reconstruct.forms.cholesky import information
 from ommatid.reconstruct.forms.square_root import square_root
@@ -21,7 +21,7 @@ from ommatid.reconstruct.problem import NotSolvableError, Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
-from ..examples import posterior_covariance, random_problem, tile_problem
+from ..examples import form_of, posterior_covariance, random_problem, tile_problem
 from .oracle_posteriors import by_array, by_singular_values
 
 
@@ -73,7 +73,7 @@ def test_singular_values_and_the_array_form_agree(seed: int, m: int, n: int, cor
 def test_more_measurements_never_raise_the_expected_error(seed: int) -> None:
     problem = random_problem(seed, 8, 6)
     fewer = Problem(problem.matrix[:5], problem.prior, problem.noise_variance[:5])
-    assert (factorise(problem)[0].variance() <= factorise(fewer)[0].variance() * (1 + 1e-9)).all()
+    assert (form_of(problem).variance() <= form_of(fewer).variance() * (1 + 1e-9)).all()
 
 
 def test_limits() -> None:
@@ -81,7 +81,7 @@ def test_limits() -> None:
     problem = random_problem(3, 9, 5)
     image = np.random.default_rng(4).normal(size=5)
     noisy = Problem(problem.matrix, problem.prior, problem.noise_variance * 1e12)
-    assert factorise(noisy)[0].variance() == pytest.approx(problem.prior.variance, rel=1e-6)
+    assert form_of(noisy).variance() == pytest.approx(problem.prior.variance, rel=1e-6)
     for factor in (1e-8, 0.0):
         sharp = Problem(problem.matrix, problem.prior, problem.noise_variance * factor)
         assert estimate(sharp, problem.matrix @ image).image == pytest.approx(image, rel=1e-6)
@@ -171,4 +171,4 @@ def test_contradictory_and_invalid_values_are_refused() -> None:
 
 def test_a_problem_that_exceeds_memory_is_refused_before_allocation() -> None:
     with pytest.raises(InputError, match="GB"):
-        factorise(Problem(sparse.csr_array((10**6, 10**6)), independent(1.0, 1.0, 10**6), np.ones(10**6)))
+        form_of(Problem(sparse.csr_array((10**6, 10**6)), independent(1.0, 1.0, 10**6), np.ones(10**6)))

@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse, stats
 
-from ommatid.reconstruct.estimator.estimate import FORMS, factorise
+from ommatid.reconstruct.estimator.estimate import FORMS
 from ommatid.reconstruct.expected_error import expected_error, expected_given, variance_of_sum
 from ommatid.reconstruct.prior import Prior, exponential, independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..examples import camera, posterior_covariance, random_problem, tile_problem
+from ..examples import camera, form_of, posterior_covariance, random_problem, tile_problem
 
 
 @given(st.integers(0, 10**6), st.floats(0.1, 10))
@@ -23,9 +23,9 @@ def test_expecting_another_noise_never_lowers_the_error(seed: int, factor: float
     """The estimator that expects the actual noise has the least error of all linear ones."""
     known = random_problem(seed, 8, 6)
     noise = {"noise": known.noise_variance}
-    right = expected_error(factorise(known)[0], noise)
+    right = expected_error(form_of(known), noise)
     mismatched = Problem(known.matrix, known.prior, factor * known.noise_variance)
-    assert (expected_error(factorise(mismatched)[0], noise).variance >= right.variance * (1 - 1e-9)).all()
+    assert (expected_error(form_of(mismatched), noise).variance >= right.variance * (1 - 1e-9)).all()
 
 
 @pytest.mark.parametrize("lenses", [3, 2, 1])
@@ -58,7 +58,7 @@ def test_eq_5_holds_over_a_thousand_images_drawn_from_the_prior(lenses: int) -> 
     """
     known = tile_problem(lenses, 0.5)
     draws, unknowns = 1000, known.unknowns
-    factorised, _ = factorise(known)
+    factorised = form_of(known)
     covariance = posterior_covariance(factorised)
     rng = np.random.default_rng(7)
     images = rng.normal(127.5, known.prior.root[:, None], (unknowns, draws))
@@ -81,7 +81,7 @@ def test_the_error_under_another_prior_than_expected_is_predicted() -> None:
     """
     known, actual = tile_problem(3, 1.0), exponential(127.5, 1000.0, (19, 19), 4.0)
     noise, unknowns = np.full(known.measurements, 4.0), known.unknowns
-    form, _ = factorise(known)
+    form = form_of(known)
     gain, root = form.gain(np.eye(known.measurements)), actual.apply_root(np.eye(actual.dimension))
     bias = root - gain @ (known.matrix @ root)
     without_image = expected_given(form, actual.mean, noise).mse
@@ -99,7 +99,7 @@ def test_the_interval_holds_99_of_100_errors(wide: bool) -> None:
     matrix = sparse.csr_array(rng.normal(size=(60, 30)) / np.geomspace(1, 300 if wide else 2, 30))
     noise = rng.uniform(0.2, 2, 60)
     truth = rng.normal(0, 2, 30)
-    form, _ = factorise(Problem(matrix, Prior(np.zeros(30), np.full(30, 3.0)), 2 * noise))
+    form = form_of(Problem(matrix, Prior(np.zeros(30), np.full(30, 3.0)), 2 * noise))
     interval = expected_given(form, truth, noise)
     draws = 20_000
     recorded = (matrix @ truth)[:, None] + rng.normal(size=(60, draws)) * np.sqrt(noise)[:, None]
@@ -112,7 +112,7 @@ def test_the_interval_holds_99_of_100_errors(wide: bool) -> None:
 def test_the_error_of_a_regions_mean() -> None:
     """By the covariance of the errors, in which those of neighbours cancel."""
     known = tile_problem(2, 1.0)
-    form, _ = factorise(known)
+    form = form_of(known)
     weights = np.zeros((19, 19))
     weights[5:11, 6:12] = 1 / 36
     flat = weights.ravel()
@@ -123,11 +123,11 @@ def test_the_error_of_a_regions_mean() -> None:
 
 def test_degrees_of_freedom_and_resolution() -> None:
     """Without noise the degrees of freedom are the rank of H; a pixel seen alone at P0 / Rv = 3 has 3/4 of one."""
-    assert expected_error(factorise(tile_problem(3, 1e-9))[0], {}).degrees_of_freedom == pytest.approx(361, abs=1e-6)
-    assert expected_error(factorise(tile_problem(2, 1e-9))[0], {}).degrees_of_freedom == pytest.approx(329, abs=1e-6)
+    assert expected_error(form_of(tile_problem(3, 1e-9)), {}).degrees_of_freedom == pytest.approx(361, abs=1e-6)
+    assert expected_error(form_of(tile_problem(2, 1e-9)), {}).degrees_of_freedom == pytest.approx(329, abs=1e-6)
     matrix = sparse.csr_array(np.diag([1.0, 1.0, 0.0]))
     known = Problem(matrix, Prior(np.zeros(3), np.full(3, 3.0**0.5)), np.array([1.0, 1e-12, 1.0]))
-    expected = expected_error(factorise(known)[0], {"noise": known.noise_variance})
+    expected = expected_error(form_of(known), {"noise": known.noise_variance})
     assert expected.resolved == pytest.approx([0.75, 1, 0])
     assert expected.resolution == pytest.approx([(4 / 3) ** 0.5, 1, np.inf])
 
@@ -136,5 +136,5 @@ def test_resolution_of_a_blur_is_its_width() -> None:
     """Sensor pixels that each average m x m target pixels, side by side: m pixels share one degree of freedom."""
     side_by_side = camera((12, 12), (("1/3", [1, 1], [4, 4]),))
     prior = Prior(np.zeros(144), np.full(144, 50.0))
-    form, _ = factorise(Problem(ideal_matrix(side_by_side), prior, np.full(16, 1e-9)))
+    form = form_of(Problem(ideal_matrix(side_by_side), prior, np.full(16, 1e-9)))
     assert expected_error(form, {}).resolution == pytest.approx(np.full(144, 3.0))

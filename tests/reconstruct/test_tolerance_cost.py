@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ommatid.reconstruct.estimator.estimate import factorise
 from ommatid.reconstruct.misalignment.moments import (
     misaligned_matrix,
     misaligned_moments,
@@ -20,13 +19,13 @@ from ommatid.scenes.camera import Camera
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..conftest import Command
-from ..examples import GALLERY, misaligned_camera
+from ..examples import GALLERY, form_of, misaligned_camera
 from ..runs import document
 
 
 def cost_of(camera: Camera, variance: float = 1e-2) -> float:
     prior, used = independent(127.5, 5461.25, camera.unknowns), np.ones(camera.measurements, dtype=np.bool_)
-    form, _ = factorise(Problem(ideal_matrix(camera), prior, np.full(camera.measurements, variance)))
+    form = form_of(Problem(ideal_matrix(camera), prior, np.full(camera.measurements, variance)))
     moments = misaligned_moments(camera, prior)
     return float(mismatch_variance(form, used, moments, camera.slices(), prior).mean())
 

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from ommatid.reconstruct.estimator.estimate import factorise
 from ommatid.reconstruct.expected_error import Interval, expected_error, interval
 from ommatid.reconstruct.forms.cholesky import information
 from ommatid.reconstruct.methods.dense_method import DRAWS, residual_power
@@ -25,7 +24,7 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from ..examples import THREE, camera, random_problem, scene, tile_problem
+from ..examples import THREE, camera, form_of, random_problem, scene, tile_problem
 from ..frames import FITTED, P0, recorded, wide
 
 NOISE = 1e-2
@@ -45,7 +44,7 @@ def explicit(problem: Problem) -> tuple[FloatArray, FloatArray]:
 @pytest.mark.parametrize("shape", [(7, 5), (5, 7)])
 def test_the_leverage_is_the_diagonal_of_h_a(correlated: bool, shape: tuple[int, int]) -> None:
     problem = random_problem(3, *shape, correlated=correlated)
-    form, _ = factorise(problem)
+    form = form_of(problem)
     leverage = expected_error(form, {"noise": problem.noise_variance}).leverage
     assert leverage == pytest.approx(np.diagonal(explicit(problem)[0]), rel=1e-9)
     assert expected_error(form, {}, np.array([1])).leverage is None, "of some pixels only"

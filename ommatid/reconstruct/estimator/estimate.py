@@ -77,12 +77,6 @@ class Estimate:
     residuals: ExactResiduals
 
 
-def factorise(problem: Problem, tolerance: float = TOLERANCE) -> tuple[Form, SolverReport]:
-    """Return a form whose posterior variances are accurate to `tolerance`. Raises InputError if there is none."""
-    form, solver, _ = _certified(ExactResiduals(problem), tolerance, None)
-    return form, solver
-
-
 def estimate(
     problem: Problem, recorded: FloatArray, tolerance: float = TOLERANCE, before: Estimate | None = None
 ) -> Estimate:
@@ -98,8 +92,6 @@ def estimate(
         )
     residuals = ExactResiduals(problem) if before is None else before.residuals
     form, solver, refined = _by_form_of(before, tolerance, recorded) or _certified(residuals, tolerance, recorded)
-    if refined is None:
-        raise RuntimeError("measurements were given, but no estimate was computed")
     multipliers = refined.multipliers[:, 0]
     with np.errstate(all="ignore"):
         image = residuals.image(DoubleDouble(refined.coefficients, refined.low)).high[:, 0]
@@ -113,7 +105,7 @@ def estimate(
 
 def _by_form_of(
     before: Estimate | None, tolerance: float, recorded: FloatArray
-) -> tuple[Form, SolverReport, RefinedSolution | None] | None:
+) -> tuple[Form, SolverReport, RefinedSolution] | None:
     """Return the estimate by the form of another one, None where that form does not reach the tolerance."""
     if before is None:
         return None
@@ -132,9 +124,9 @@ def _chain(problem: Problem) -> tuple[list[str], str]:
 
 
 def _certified(
-    residuals: ExactResiduals, tolerance: float, recorded: FloatArray | None
-) -> tuple[Form, SolverReport, RefinedSolution | None]:
-    """Return the first form that reaches the tolerance, its report, and the estimate if there are measurements."""
+    residuals: ExactResiduals, tolerance: float, recorded: FloatArray
+) -> tuple[Form, SolverReport, RefinedSolution]:
+    """Return the first form that reaches the tolerance, its report, and the estimate."""
     names, why = _chain(residuals.problem)
     tried: list[RejectedForm] = []
     solver: SolverReport | None = None
@@ -152,7 +144,7 @@ def _certified(
             return form, solver.model_copy(update={"tried": tuple(tried)}), refined
         tried.append(RejectedForm(method=name, why_not=failure))
     known = solver is not None and solver.bound is not None and solver.bound < UNKNOWN_BOUND
-    if refined is not None and recorded is not None and known:
+    if refined is not None and known:
         _check_contradictions(residuals, recorded, refined)
     raise InputError(
         f"no form of the estimator reaches a relative error of {tolerance:g} here ("
@@ -194,10 +186,8 @@ def _with_variances(form: Form, why: str, residuals: ExactResiduals, tolerance: 
 
 
 def _with_estimate(
-    solver: SolverReport, form: Form, residuals: ExactResiduals, recorded: FloatArray | None
-) -> tuple[SolverReport, RefinedSolution | None]:
-    if recorded is None:
-        return solver, None
+    solver: SolverReport, form: Form, residuals: ExactResiduals, recorded: FloatArray
+) -> tuple[SolverReport, RefinedSolution]:
     with np.errstate(all="ignore"):
         deviation = residuals.recorded(recorded)
     refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), deviation)

@@ -171,6 +171,16 @@ def test_a_letter_is_upright_with_square_pixels(letter: Path, shown: Opened) -> 
         assert right - left == pytest.approx(bottom - top, abs=1)
 
 
+@pytest.mark.parametrize("width", [1280, 390])
+def test_pictures_of_a_row_line_up_though_a_heading_wraps(width: int, letter: Path, shown: Opened) -> None:
+    with shown(letter, width=width) as page:
+        pictures = [canvas(page, name) for name in ("truth", "single")]
+        tops = [picture.evaluate("picture => picture.getBoundingClientRect().top") for picture in pictures]
+        headings = [picture.evaluate("picture => picture.previousElementSibling.offsetHeight") for picture in pictures]
+        assert headings[1] > 1.5 * headings[0]
+        assert tops[0] == pytest.approx(tops[1], abs=0.5)
+
+
 @pytest.mark.slow
 def test_errors_are_the_difference_of_two_maps(letter: Path, run: Run, shown: Opened) -> None:
     assert run.truth is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,9 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 
+from .lens_table import AXIS_AND_RIM, lens_rows
+
+Section = tuple[str, Sequence[tuple[str, ...]]]  # title and rows, whose first cell names the others
 METHODS = {
     "dense": "one dense problem",
     "fit": "one dense problem, H fitted to the stack",
@@ -130,8 +134,8 @@ def _plan(scene: Scene, camera: Camera, variant: str, choice: MethodChoice | Non
     }
 
 
-def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the description as titled tables of two columns."""
+def sections(description: dict[str, Any]) -> list[Section]:
+    """Return the description as titled tables: of names and values, and of the lens types by quantities."""
     target = description["target"]
     geometry = [
         ("target", f"{target['rows']} x {target['columns']} pixels, {target['height']:g} x {target['width']:g} mm"),
@@ -146,11 +150,8 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
         geometry += [("edges", words) for words in description["where"]]
     else:
         geometry.append(("edges", "every pixel is seen by every lens type"))
-    wavelength = description["camera"]["wavelength"]
-    lenses = [
-        (f"lens type {lens['name']}, {lens['magnification']}", _lens_words(lens, wavelength))
-        for lens in description["lens_types"]
-    ]
+    types = description["lens_types"]
+    lenses = [("lens type", *(lens["name"] for lens in types)), *lens_rows(types, description.get("optics", ()))]
     stages = [
         (stage, ", ".join(f"{key} {value}" for key, value in plan.items()))
         for stage, plan in description["plan"].items()
@@ -158,7 +159,7 @@ def sections(description: dict[str, Any]) -> list[tuple[str, list[tuple[str, str
     skipped = [(skip["what"], skipped_words(skip["why"], skip.get("bound"))) for skip in description["skipped"]]
     return [
         (description["title"] or "Camera", geometry),
-        ("Lens types", lenses),
+        (f"Lens types; {AXIS_AND_RIM}" if "optics" in description else "Lens types", lenses),
         ("What will run", stages),
         ("What is left out, and why", skipped),
     ]
@@ -184,31 +185,6 @@ def _camera_rows(camera: dict[str, Any]) -> list[tuple[str, str]]:
         ("lenses", f"{camera['lenses']}, total track {camera['total_track']:.4g} mm"),
         ("sensor area", area),
     ]
-
-
-def _lens_words(lens: dict[str, Any], wavelength: float) -> str:
-    array, pixels = lens["array"], lens["pixels"]
-    across, down = (f"{angle:.3g}" for angle in (lens["field_of_view"][1], lens["field_of_view"][0]))
-    view = f"{across} degrees" if across == down else f"{down} x {across} degrees (height x width)"
-    aperture, disk = "", ""
-    if lens["f_number"] is not None:
-        aperture = f" f/{lens['f_number']:.3g},"
-        disk = f", Airy disk {lens['airy_pixels']:.3g} pixels at {wavelength * 1e6:.4g} nm"
-    return "\n".join(
-        [
-            f"{array[0]} x {array[1]} sub-imagers of {pixels[0]} x {pixels[1]} pixels,"
-            f" {lens['sub_image_width']:.3g} mm wide, rows {lens['sees_rows'][0]:g} to {lens['sees_rows'][1]:g}"
-            + (f", {lens['steered']} of them steered" if "steered" in lens else "")
-            + (f", {lens['fill_factor']} of a pixel's side open" if "fill_factor" in lens else ""),
-            f"  optical magnification {_ratio(lens['optical_magnification'])}, focal length"
-            f" {lens['focal_length']:.4g} mm,{aperture} sensor {lens['total_track']:.4g} mm behind the lens",
-            f"  field of view {view}{disk}",
-        ]
-    )
-
-
-def _ratio(magnification: float) -> str:
-    return f"{magnification:.4g}" if magnification >= 1 else f"1/{1 / magnification:.4g}"
 
 
 def light_rows(light: dict[str, Any]) -> list[tuple[str, str]]:

@@ -18,8 +18,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.printable import LONGEST_MESSAGE, printable, printable_sentence
 
 if TYPE_CHECKING:
+    from ommatid.analysis.summary import Section
     from ommatid.batch.remote import RunObserver
-    from ommatid.pipeline.sections import Section
     from ommatid.reconstruct.output.run_json import RunReport
     from ommatid.runtime.progress import Progress
 
@@ -27,6 +27,7 @@ Detail = Literal["table", "summary", "verdict"]
 
 LONGEST_LINE = 1000  # characters of a line on stdout, or of a cell of a table
 MOST_WARNINGS = 20  # which are printed of one list
+WIDE = 72  # columns in which a table of several values keeps its names in one line
 LEAST_WIDTH = 40  # columns of a table; in narrower ones, numbers would be cut off
 
 FILE_OF_STAGE = {"render": "stack.exr", "report": "report.html"}
@@ -73,20 +74,25 @@ def print_result(document: object, sections: Iterable[Section], as_json: bool, f
 
 
 def print_tables(sections: Iterable[Section]) -> None:
-    """Print titled tables of two columns on stdout. Brackets and colons in a title have no special meaning."""
+    """Print titled tables on stdout. Brackets and colons in a title have no special meaning."""
     from rich.console import Console
     from rich.table import Table
 
     for title, lines in sections:
-        table = Table("", "", title=printable_sentence(title, LONGEST_MESSAGE), title_justify="left", show_header=False)
-        for name, value in lines:
-            table.add_row(
-                printable(name),
-                printable(value, LONGEST_LINE),
-                style="bold red" if (name, value[:3]) == ("verdict", "not") else None,
-            )
         console = Console(markup=False, emoji=False)
         console.width = max(console.width, LEAST_WIDTH)
+        named = printable_sentence(title, LONGEST_MESSAGE)
+        table = Table(title=named, title_justify="left", show_header=False)
+        columns = max(map(len, lines), default=2)
+        for column in range(columns):
+            whole = column == 0 and columns > 2 and console.width >= WIDE  # names of quantities are short
+            table.add_column(overflow="fold", no_wrap=whole)
+        for name, *values in lines:
+            table.add_row(
+                printable(name),
+                *(printable(value, LONGEST_LINE) for value in values),
+                style="bold red" if name == "verdict" and values[0].startswith("not") else None,
+            )
         console.print(table)
 
 

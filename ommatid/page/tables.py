@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ommatid.analysis import depth_error, run_table, study
+from ommatid.analysis.lens_table import lens_rows
 from ommatid.analysis.summary import describe, skipped_words
 from ommatid.reconstruct.output.run_json import FILES, PAGE, RunReport, StageReport
 from ommatid.reconstruct.output.verdict_words import is_trusted
@@ -102,27 +103,7 @@ def skipped(run: Run) -> PageTable:
 def geometry(scene: Scene, camera: Camera) -> tuple[PageTable, list[tuple[str, str]]]:
     """Return a table of the lens types, and names and values of the other dimensions."""
     described, terms = describe(Setup(scene, camera), "", None), optical_terms(scene, camera)
-    header = ("lens type", "magnification", "on the pixel grid", "array", "pixels per sub-image", "rows seen")
-    header += ("columns seen", "focal length", "f-number", "field of view", "Airy disk", "lens to sensor")
-    header += ("measurements",)
-    rows = [
-        (
-            lens["name"],
-            f"1/{1 / optics.magnification:.4g}",
-            lens["magnification"],
-            _product(lens["array"]),
-            _product(lens["pixels"]),
-            _range(lens["sees_rows"]),
-            _range(lens["sees_columns"]),
-            f"{optics.focal_length:.4g} mm",
-            "pinhole" if optics.f_number is None else f"f/{optics.f_number:.3g}",
-            f"{optics.field_of_view[0]:.3g}° × {optics.field_of_view[1]:.3g}°",
-            "" if optics.airy_diameter is None else f"{optics.airy_diameter:.3g} pixels",
-            f"{lens['sensor_depth']:.4g} mm",
-            str(lens["measurements"]),
-        )
-        for lens, optics in zip(described["lens_types"], terms.types, strict=True)
-    ]
+    types = described["lens_types"]
     target = described["target"]
     facts = [
         ("target", f"{target['rows']} × {target['columns']} pixels, {target['height']:g} × {target['width']:g} mm"),
@@ -131,20 +112,12 @@ def geometry(scene: Scene, camera: Camera) -> tuple[PageTable, list[tuple[str, s
         ("pitch of the sensor pixels", f"{1000 * camera.pixel_pitch:g} µm"),
         ("pitch of the lenses", f"{camera.lens_pitch:g} mm"),
         *(
-            (f"pixels seen by only {count} of {len(rows)} lens types", str(pixels))
+            (f"pixels seen by only {count} of {len(camera.types)} lens types", str(pixels))
             for count, pixels in described["pixels_seen_by_fewer_types"].items()
         ),
         *(("edge of the target", words) for words in described["where"]),
     ]
-    return PageTable("Lens types", header, rows), facts
-
-
-def _product(pair: list[int]) -> str:
-    return f"{pair[0]}{NBSP}×{NBSP}{pair[1]}"
-
-
-def _range(ends: list[float]) -> str:
-    return f"{ends[0]:g} to {ends[1]:g}"
+    return PageTable("Lens types", ("lens type", *(lens["name"] for lens in types)), lens_rows(types)), facts
 
 
 def numbers(run: Run) -> PageTable:

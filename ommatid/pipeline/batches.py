@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ommatid.analysis.summary import Section
 from ommatid.batch import sweep
 from ommatid.batch.batch import Batch, Description, Member
 from ommatid.batch.remote import RunObserver, Stages
@@ -25,7 +26,6 @@ from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
 from ommatid.scenes.scene import read
 
-from .sections import Section
 from .stages import library_versions, open_member, process_count
 
 

@@ -1,32 +1,26 @@
-"""What commands print of each result: tables, and the lines of a run.
-
-A section is a title and rows of a name and a value.
-"""
+"""What commands print of each result: tables, and the lines of a run."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import sqrt
 from pathlib import Path
 from typing import Any
 
 from ommatid.analysis import depth_error, predict, prediction_table, run_table, study, summary
 from ommatid.analysis.run_table import region_row
+from ommatid.analysis.summary import Section
 from ommatid.reconstruct.output.run_json import ErrorReport, RunReport
 from ommatid.reconstruct.output.verdict_words import grounds, heading, limit
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.printable import printable
 from ommatid.scenes.scene import Scene
 from ommatid.simulate import world_view
-from ommatid.simulate.lenses import sharpness
-
-Section = tuple[str, list[tuple[str, str]]]
 
 
 def run_sections(folder: Path, description: dict[str, Any]) -> list[Section]:
     """Tabulate the description of a finished run in `folder`."""
     report = RunReport.model_validate(description)
-    sections = [(f"{printable(report.title or folder.name)}: {folder}", run_table.rows(report))]
+    sections: list[Section] = [(f"{printable(report.title or folder.name)}: {folder}", run_table.rows(report))]
     if report.depth:
         sections.append(("Error against distance", depth_error.rows(report.depth)))
     if report.study:
@@ -35,11 +29,11 @@ def run_sections(folder: Path, description: dict[str, Any]) -> list[Section]:
 
 
 def scene_sections(description: dict[str, Any]) -> list[Section]:
-    """Tabulate the description of a scene: geometry, lens types, optics, electrons, plan, skipped effects."""
+    """Tabulate the description of a scene: geometry, lens types, electrons, plan, skipped effects."""
     geometry, lenses, *others = summary.sections(description)
-    optics, world = _optics_sections(description.get("optics", ())), description.get("world")
-    worlds = [] if world is None else [("World", world_view.rows(world))]
-    return [geometry, *worlds, lenses, *optics, *_light_sections(description), *others]
+    world = description.get("world")
+    worlds: list[Section] = [] if world is None else [("World", world_view.rows(world))]
+    return [geometry, *worlds, lenses, *_light_sections(description), *others]
 
 
 def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, Any] | None) -> list[Section]:
@@ -62,10 +56,6 @@ def backend_sections(description: dict[str, Any]) -> list[Section]:
         for backend in description["backends"]
     ]
     return [("Backends", backends), ("Versions", list(description["versions"].items()))]
-
-
-def _optics_sections(optics: Sequence[dict[str, Any]]) -> list[Section]:
-    return [("Optics", [(f"lens type {lens['lens']}", sharpness.words(lens)) for lens in optics])] if optics else []
 
 
 def _light_sections(description: dict[str, Any]) -> list[Section]:

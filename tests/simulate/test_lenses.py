@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ommatid.analysis.lens_table import lens_rows
 from ommatid.reconstruct.noise import usable_pixels
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
@@ -133,6 +134,10 @@ def test_a_corner_without_light_has_no_spot_size() -> None:
     """JSON has no NaN, and a table no `nan um`."""
     described = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), noise={"variance": 1.0})
     (found,) = sharpness.describe(derive(described))
-    assert found["spot_corner"] is None
+    assert found["spot_rim"] is None
     assert found["spot_axis"] > 0
-    assert "no light at the corner" in sharpness.words(found)
+    assert found["illumination"] == 0
+    described_type = {"name": found["lens"], "magnification": "1/3"}
+    rows = {row[0]: row[1] for row in lens_rows([described_type], [found])}
+    assert rows["spot, rms um"].endswith("/ no light")
+    assert rows["distortion, %"] == "no light"

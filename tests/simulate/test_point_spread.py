@@ -145,7 +145,7 @@ def test_more_waves_than_can_be_computed_are_refused() -> None:
 
 def test_the_wave_of_a_thin_lens() -> None:
     """Focused beyond the target: W20 = D^2 / 8 (1 / Z - 1 / F) waves, and light falls with cos^4 to the rim."""
-    wave = thin_wavefront(0.4, 3.0, 1000.0, 1250.0, WAVELENGTH)
+    wave = thin_wavefront(0.4, 3.0, 0.0, 1000.0, 1250.0, WAVELENGTH)
     waves = 0.4**2 / 8 * (1 / 1000 - 1 / 1250) / WAVELENGTH
     assert strehl_ratio(wave) == pytest.approx(np.sinc(waves) ** 2, abs=1e-4)
     assert wave.resolution == pytest.approx(WAVELENGTH * 1000 / 0.4, rel=1e-6)

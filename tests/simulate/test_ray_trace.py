@@ -300,21 +300,24 @@ def test_a_thin_real_lens_is_reported_as_a_thin_lens() -> None:
     (ideal,) = sharpness.describe(derive(read(GALLERY / "tile19.toml", data, ["I"])))
     assert real.keys() == ideal.keys()
     for name, value in ideal.items():
-        loose = {"sharpest": 0.1, "spot_axis": 0.15, "spot_corner": 0.15}.get(name, 2e-3)
+        if name in ("curvature", "distortion"):  # which a thin lens does not have
+            continue
+        loose = 0.15 if name.startswith(("spot", "sharpest", "wavefront")) else 5e-3
         assert real[name] == (value if value is None or name == "lens" else pytest.approx(value, rel=loose)), name
-    assert "f/13.3" in sharpness.words(real)
+    assert real["f_number"] == pytest.approx(13.3, abs=0.05)
+    assert abs(real["distortion"]) < 1e-3
 
 
 def test_a_lens_s_rays_are_sharpest_short_of_the_paraxial_focus() -> None:
     """Spherical aberration of a single lens; the distance of least spot is one that no other beats."""
     camera = derive(read(GALLERY / "planoconvex.toml"))
     best = sharpness.describe(camera)[0]
-    assert best["sharpest"] < best["focus"] == pytest.approx(camera.distance)
+    assert best["sharpest_axis"] < best["focus"] == pytest.approx(camera.distance)
     kind = camera.types[0]
     one = prescription_of(camera, kind)
     (x, _), (u, _, w), weight = trace(
         path(one, exit_disk_of(camera, kind, one)), 0.0, 0.0, *spread(4096), camera.depth(kind)
     )
-    distances = best["sharpest"] * np.array([0.9, 0.99, 1.0, 1.01, 1.1])
+    distances = best["sharpest_axis"] * np.array([0.9, 0.99, 1.0, 1.01, 1.1])
     angles = [np.sqrt(np.sum(weight * (x + z * u / w) ** 2)) / z for z in distances]
     assert int(np.argmin(angles)) == 2

@@ -1,5 +1,6 @@
-"""What one lens type with surfaces does over its field: where rays go, how much light passes, and how points blur.
+"""What one lens type does over its field: where rays go, how much light passes, and how points blur.
 
+A kind of lens is a class that yields the wave of a sensor point: `ThinField` and `SurfaceField`. All else follows.
 Lengths are millimetres, in the coordinates of the lens. The lens is round, so that everything depends on the height of
 the sensor point above the axis; point-spread functions turn with its direction. They are computed at nodes of height,
 as many as linear interpolation between them needs.
@@ -7,6 +8,7 @@ as many as linear interpolation between them needs.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
@@ -23,7 +25,7 @@ from ommatid.scenes.lens_type import LensType
 from .point_spread import grid_of, point_spread
 from .prescription import Prescription, prescribe, prescription_of
 from .ray_trace import Disk, exit_disk, reach
-from .wavefront import Wavefront, wavefront_of
+from .wavefront import Wavefront, thin_wavefront, wavefront_of
 
 HEIGHTS = 17  # at which the middle and the amount of the light are traced, splines between
 TOLERANCE = 1e-3  # of a point-spread function: the sum of the absolute errors of its cells
@@ -35,26 +37,44 @@ MOST_RINGS = 100.0  # spots of more than so many `resolution`s are computed by r
 
 
 @dataclass(frozen=True, eq=False)
-class LensField:
+class LensField(ABC):
     """One lens type at one wavelength.
 
     distance : of the target from the front principal plane;  depth : of the sensor behind the rear one
     field : the largest height of a sensor point
     """
 
-    prescription: Prescription
-    disk: Disk
     depth: float
     distance: float
     field: float
     wavelength: float | None
 
+    @abstractmethod
     def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
         """Return the wave of a sensor point (0, height), or None if it gets no light.
 
         half : of the width of the grid that the wave's nodes serve, where it is wider than that of its own
         """
-        return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, half)
+
+    @property
+    @abstractmethod
+    def focal_length(self) -> float:
+        """The focal length."""
+
+    @property
+    @abstractmethod
+    def entrance_pupil(self) -> tuple[float, float]:
+        """Diameter of the entrance pupil, and how far it is before the front principal plane."""
+
+    @property
+    @abstractmethod
+    def working_f_number(self) -> float:
+        """Ratio of length to width of the cone of light at the sensor."""
+
+    @property
+    @abstractmethod
+    def exit_solid_angle(self) -> float:
+        """Projected solid angle of the disk over which rays leave evenly, seen from the sensor's middle, sr."""
 
     @cached_property
     def _rays(self) -> tuple[FloatArray, list[Wavefront]]:
@@ -85,7 +105,7 @@ class LensField:
 
     def lit_share(self, height: FloatArray) -> FloatArray:
         """Return the mean weight of rays that leave evenly spread over the exit disk, as `trace` gives it."""
-        return self.brightness(height) / (pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2)
+        return self.brightness(height) / self.exit_solid_angle
 
     @property
     def pupil_radius(self) -> float:
@@ -115,7 +135,7 @@ class LensField:
         if self.wavelength is None or not self.rays_suffice:
             return 0.0
         spot = max(wave.spot_radius for wave in self._rays[1])
-        defocus = self.pupil_radius * abs(1 - self.distance * (1 / self.prescription.focal_length - 1 / self.depth))
+        defocus = self.pupil_radius * abs(1 - self.distance * (1 / self.focal_length - 1 / self.depth))
         return spot * 2 * self._rays[1][0].half_width / self.wavelength if spot > MOST_ABERRATED * defocus else 0.0
 
     @cached_property
@@ -196,6 +216,71 @@ class LensField:
         return spread
 
 
+@dataclass(frozen=True, eq=False)
+class SurfaceField(LensField):
+    """A lens of surfaces; disk : through which rays leave towards the sensor."""
+
+    prescription: Prescription
+    disk: Disk
+
+    def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
+        """Trace the wave through the surfaces; see `LensField.wave`."""
+        return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, half)
+
+    @property
+    def focal_length(self) -> float:
+        """The focal length."""
+        return self.prescription.focal_length
+
+    @property
+    def entrance_pupil(self) -> tuple[float, float]:
+        """Diameter of the entrance pupil, and how far it is before the front principal plane."""
+        pupil = self.prescription.entrance_pupil
+        return 2 * pupil.radius, self.prescription.front_principal - pupil.position
+
+    @property
+    def working_f_number(self) -> float:
+        """Ratio of length to width of the cone of light at the sensor."""
+        return self.prescription.working_f_number(self.depth)
+
+    @property
+    def exit_solid_angle(self) -> float:
+        """Projected solid angle of the exit disk, seen from the sensor's middle, sr."""
+        return pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class ThinField(LensField):
+    """A thin lens; aperture : its diameter;  focus : distance of the target that would be sharp."""
+
+    aperture: float
+    focus: float
+
+    def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
+        """Compute the wave, whose phase is quadratic; see `LensField.wave`."""
+        return thin_wavefront(self.aperture, self.depth, height, self.distance, self.focus, wavelength, half)
+
+    @property
+    def focal_length(self) -> float:
+        """The focal length."""
+        return 1 / (1 / self.depth + 1 / self.focus)
+
+    @property
+    def entrance_pupil(self) -> tuple[float, float]:
+        """Diameter of the lens, and 0."""
+        return self.aperture, 0.0
+
+    @property
+    def working_f_number(self) -> float:
+        """Ratio of length to width of the cone of light at the sensor."""
+        return self.depth / self.aperture
+
+    @property
+    def exit_solid_angle(self) -> float:
+        """Projected solid angle of the lens, seen from the sensor's middle, sr."""
+        return pi * (self.aperture / (2 * self.depth)) ** 2
+
+
 def _lit(wave: Wavefront | None, height: float) -> Wavefront:
     if wave is None:
         raise ValueError(f"no light at a height of {height:g} mm, expected a lit one")
@@ -261,16 +346,20 @@ def bands(camera: Camera) -> tuple[tuple[float | None, float], ...]:
 
 @lru_cache(maxsize=16)
 def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> LensField:
-    """Return a lens type of the camera at a wavelength.
+    """Return a lens type of the camera at a wavelength. Expects no pinhole.
 
-    The lens is scaled and placed as at the camera's wavelength; another one changes the glass alone, so that principal
-    planes move and the distances from them with them. Raises InputError if the surfaces form no image.
+    A lens of surfaces is scaled and placed as at the camera's wavelength; another one changes the glass alone, so that
+    principal planes move and the distances from them with them. Raises InputError if the surfaces form no image.
     """
-    lens, depth, distance = prescription_of(camera, lens_type), camera.depth(lens_type), camera.distance
-    if wavelength is not None and wavelength != camera.wavelength and lens_type.optics.surfaces is not None:
+    (far, _, _), depth, distance = reach(camera, lens_type), camera.depth(lens_type), camera.distance
+    if lens_type.optics.surfaces is None:
+        if lens_type.optics.aperture is None:
+            raise ValueError(f"lens type '{lens_type.name}' is a pinhole, expected a lens")
+        return ThinField(depth, distance, far, wavelength, lens_type.optics.aperture, camera.focus(lens_type))
+    lens = prescription_of(camera, lens_type)
+    if wavelength is not None and wavelength != camera.wavelength:
         other = replace(lens, index=prescribe(lens_type.optics.surfaces, wavelength).index)
         depth += lens.rear_principal - other.rear_principal
         distance += other.front_principal - lens.front_principal
         lens = other
-    far, _, _ = reach(camera, lens_type)
-    return LensField(lens, exit_disk(lens, depth, far), depth, distance, far, wavelength)
+    return SurfaceField(depth, distance, far, wavelength, lens, exit_disk(lens, depth, far))

@@ -126,28 +126,41 @@ def polar_nodes(counts: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatA
     return radius, angle, weights[:, None] / 2 * radius * (2 * pi / counts[1])
 
 
-def thin_wavefront(aperture: float, depth: float, distance: float, focus: float, wavelength: float) -> Wavefront:
-    """Return the wave of the sensor's middle behind a thin lens that is focused at `focus`; all distances positive.
+def thin_wavefront(
+    aperture: float,
+    depth: float,
+    height: float,
+    distance: float,
+    focus: float,
+    wavelength: float | None,
+    half: float = 0.0,
+) -> Wavefront:
+    """Return the wave of the sensor point (0, height) behind a thin lens that is focused at `focus`.
 
-    Its nodes serve a grid that reaches GRID_REACH beyond the spot.
+    distance, half : as of `wavefront_of`
     """
-    half = aperture / 2
-    spot, unit = half * abs(1 - distance / focus), wavelength * distance / aperture
-    radius, angle, area = polar_nodes(node_counts(0.5 / unit, spot, spot + GRID_REACH * unit))
-    x = half * (radius * np.stack([np.cos(angle), np.sin(angle)])).reshape(2, -1)
-    share = np.broadcast_to(area, (radius.size, angle.size)).ravel() * half**2
-    square = np.square(x).sum(axis=0)
-    light = share / (1 + square / depth**2) ** 2
-    path = square / 2 * (1 / distance - 1 / focus)
+    spot, counts = aperture / 2 * abs(1 - distance / focus), RAY_NODES
+    if wavelength is not None:
+        unit = wavelength * abs(distance) / aperture
+        counts = node_counts(0.5 / unit, spot, max(half, spot + GRID_REACH * unit))
+    radius, angle, area = polar_nodes(counts)
+    at = aperture / 2 * (radius * np.stack([np.cos(angle), np.sin(angle)])).reshape(2, -1)
+    share = np.broadcast_to(area, (radius.size, angle.size)).ravel() * (aperture / 2) ** 2
+    light = share / (1 + (at[0] ** 2 + (at[1] - height) ** 2) / depth**2) ** 2
+    brightness = float(light.sum()) / depth**2
+    light /= light.sum()
+    hits = at * (1 - distance / focus)
+    middle = hits @ light  # from the chief ray: the side of the lens that is nearer to the sensor point is brighter
+    path = np.square(at).sum(axis=0) / 2 * (1 / distance - 1 / focus) - middle @ at / distance
     return Wavefront(
         wavelength=wavelength,
-        cosines=x / distance,
-        path=path - light @ path / light.sum(),
-        light=light / light.sum(),
-        density=share / distance**2,
-        hits=x * (1 - distance / focus),
-        centre=(0.0, 0.0),
-        brightness=float(light.sum()) / depth**2,
+        cosines=at / distance,
+        path=path - light @ path,
+        light=light,
+        density=np.zeros(0) if wavelength is None else share / distance**2,
+        hits=hits - middle[:, None],
+        centre=(float(middle[0]), float(middle[1]) - height * distance / depth),
+        brightness=brightness,
         outermost=float(radius[-1, 0]),
     )
 

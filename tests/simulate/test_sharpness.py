@@ -1,0 +1,95 @@
+"""What `show` says of lenses, against closed forms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ommatid.analysis.lens_table import lens_rows
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.scene import parse, read
+from ommatid.simulate.lenses import sharpness
+from ommatid.simulate.lenses.field import field_of
+
+from ..examples import GALLERY
+
+LARGE = ("camera.lens_pitch=1 mm", "target.shape=[185, 185]", "target.origin=[0, 0]", "camera.lens.I.pixels=[61, 61]")
+
+
+def thin(*changes: str) -> Camera:
+    """Return a camera of one lens type, 61 x 61 pixels, with changes of its lens."""
+    wide = (*LARGE, *(f"camera.lens.I.{change}" for change in changes))
+    return derive(read(GALLERY / "tile19.toml", wide, ["I"]))
+
+
+@pytest.mark.parametrize("waves", [0.0, 0.21, 0.5, 1.0, 2.0])
+def test_a_defocused_thin_lens(waves: float) -> None:
+    """W20 waves at the rim: a deviation of W20 / sqrt(12) over a uniform disk, and a Strehl ratio of sinc(W20)^2.
+
+    Light at the rim of an f/20 lens is within 0.13 % of that on the axis.
+    """
+    aperture, distance, wavelength = 0.1, 1000.0, 5.5e-4
+    focus = 1 / (1 / distance + 8 * waves * wavelength / aperture**2)
+    (found,) = sharpness.describe(thin(f"aperture={aperture} mm", f"focus={focus} mm"))
+    assert found["wavefront_axis"] == pytest.approx(waves / np.sqrt(12), rel=2e-3, abs=1e-9)
+    centre = np.sinc(waves) ** 2  # the peak itself where less than a wave is lost
+    if waves < 1:
+        assert found["strehl_axis"] == pytest.approx(centre, abs=1e-3)
+    else:
+        assert found["strehl_axis"] > centre
+    assert [found["sharpest_axis"], found["sharpest_rim"]] == pytest.approx([focus, focus], rel=1e-6)
+    assert found["focus"] == pytest.approx(focus, rel=1e-9)
+
+
+def test_a_thin_lens_is_darker_at_the_rim_by_the_fourth_power_of_the_cosine() -> None:
+    camera = thin("aperture=20 um")
+    (found,) = sharpness.describe(camera)
+    kind = camera.types[0]
+    square = 2 * (61 / 2 * camera.pixel_pitch / camera.depth(kind)) ** 2
+    assert found["illumination"] == pytest.approx(1 / (1 + square) ** 2, rel=1e-4)
+    assert found["distortion"] == 0
+    assert found["curvature"] == pytest.approx(0, abs=1e-9)
+
+
+def test_the_given_distortion_is_reported_where_the_sensor_ends() -> None:
+    """Magnification times 1 + k1 r^2, r of the object point whose image is the farthest sensor point."""
+    camera = derive(read(GALLERY / "distorted.toml", ["camera.lens.I.aperture=0.1 mm", "camera.lens_pitch=1 mm"]))
+    (found,) = sharpness.describe(camera)
+    kind = camera.types[0]
+    field, (k1, k2) = field_of(camera, kind, None), kind.optics.distortion or (0.0, 0.0)
+    image = field.field / camera.depth(kind) * camera.distance / camera.half_diagonal
+    radius = np.linspace(0, image, 200_001)
+    at = float(np.interp(image, radius * (1 + k1 * radius**2 + k2 * radius**4), radius))
+    assert found["distortion"] == pytest.approx(k1 * at**2 + k2 * at**4, rel=1e-6)
+
+
+def test_the_field_of_a_thin_single_lens_is_curved_as_the_third_order_says() -> None:
+    """Stop at the lens: best images on h^2 / 2f (2 + 1/n), midway between tangential 3 + 1/n and sagittal 1 + 1/n.
+
+    The distance of the image does not matter to the third order but by h, the height on the image.
+    """
+    rows: list[dict[str, Any]] = [
+        {"radius": "2 mm", "thickness": "1 um", "index": 1.5, "semi_diameter": "75 um"},
+        {"radius": "-2 mm", "semi_diameter": "75 um"},
+    ]
+    data = read(GALLERY / "tile19.toml", LARGE, ["I"]).plain()
+    data["camera"]["lens"][0]["surfaces"] = rows
+    camera = derive(parse(data, Path("test.toml")))
+    (found,) = sharpness.describe(camera)
+    field = field_of(camera, camera.types[0], None)
+    expected = -(field.field**2) / (2 * field.focal_length) * (2 + 1 / 1.5)
+    assert found["curvature"] == pytest.approx(expected, rel=0.03)
+    assert abs(found["distortion"]) < 1e-3
+
+
+def test_quantities_that_no_lens_has_are_not_in_the_table() -> None:
+    camera = thin("aperture=0.1 mm")
+    lens = {"name": "I", "magnification": "1/3"}
+    optics = sharpness.describe(camera)
+    names = [name for name, _ in lens_rows([lens], optics)]
+    assert "Strehl ratio" in names
+    assert "steered" not in names
+    assert [name for name, _ in lens_rows([lens])] == ["magnification"]

@@ -69,6 +69,7 @@ def _of_waves(key: str) -> tuple[str, Callable[[Lens], str]]:
 
 AXIS_AND_RIM = "a / b: on the lens's axis / at the sensor point farthest from it"
 QUANTITIES: tuple[tuple[str, str, Callable[[Lens], str]], ...] = (
+    ("lens", *_of("kind", str)),
     ("magnification", *_of("magnification", str)),
     ("on the sensor", *_of("optical_magnification", _ratio)),
     ("sub-images", *_of("array", _product)),

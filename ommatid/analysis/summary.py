@@ -81,6 +81,7 @@ def _light_words(camera: Camera) -> str:
 def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
     return {
         "name": lens_type.name,
+        "kind": _kind(lens_type),
         "magnification": str(1 / lens_type.ratio),
         "array": list(lens_type.array),
         "pixels": list(lens_type.pixels),
@@ -94,6 +95,13 @@ def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "sub_image_width": lens_type.pixels[1] * camera.pixel_pitch,
         "measurements": lens_type.measurements,
     }
+
+
+def _kind(lens_type: LensType) -> str:
+    surfaces = lens_type.optics.surfaces
+    if surfaces is not None:
+        return f"{len(surfaces)} surfaces"
+    return "pinhole" if lens_type.optics.aperture is None else "thin lens"
 
 
 def _unseen_edges(camera: Camera) -> list[str]:

@@ -49,7 +49,7 @@ def show(
     as_json: Json = False,
 ) -> None:
     """Show the camera in the terms of optics, the plan, and the skipped effects."""
-    from ommatid.pipeline.descriptions import describe_scene
+    from ommatid.pipeline.descriptions import describe_scene, focus_curves
     from ommatid.pipeline.sections import scene_sections
     from ommatid.scenes.formats.picture import conversions
     from ommatid.scenes.scene import read
@@ -61,7 +61,7 @@ def show(
         from ommatid.figures.camera_drawing import write_drawing
 
         files = options.figure_files(figure_formats, figure_resolution, figure.suffix.lstrip(".").lower())
-        for path in write_drawing(figure, described, files):
+        for path in write_drawing(figure, described, files, focus_curves(described)):
             output.say(f"{path}: written")
     output.print_result(description, scene_sections(description), as_json)
     output.warn_all(description["warnings"])

@@ -1,11 +1,14 @@
 """Drawing of a camera: section through lenses and target, the sensor face on, and one sub-image of each lens type.
 
+Where lenses make waves, their contrast is drawn against the place of the sensor, too.
+
 Positions are millimetres, as in the camera: z along its axis, x and y across. The section is broken between the camera,
 a few millimetres deep, and the target; the ratio of the scales is written at the break.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +16,7 @@ from typing import Any
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.printable import printable_label
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.geometry.optical_terms import LensTerms, OpticalTerms, optical_terms
+from ommatid.scenes.geometry.optical_terms import LensTerms, OpticalTerms, ThroughFocus, optical_terms
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.scene import Scene
 
@@ -23,6 +26,7 @@ from .sensor_drawing import ARROW, draw_sensor, draw_sub_images, length_words, s
 WIDTH = 10.0  # inches, as are all lengths of the layout
 LEFT, NEAR_WIDTH, FAR_LEFT, FAR_WIDTH = 0.75, 4.7, 6.15, 3.1
 ABOVE, SECTION, BETWEEN, BELOW, LINE = 1.05, 2.5, 1.25, 0.55, 0.21
+FOCUS = 1.6  # height of the curves through focus
 LOWEST, HIGHEST = 1.9, 3.4  # height of the drawing of the sensor
 GREY = "#808080"
 NEAR, FAR = 0.45, 0.6  # ends of the broken axis: a share of the deepest sensor, and of the target's distance
@@ -33,41 +37,66 @@ Ray = tuple[tuple[float, float], ...]  # points (z, x)
 
 
 @own_style()
-def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True) -> Any:
+def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True, curves: Sequence[ThroughFocus] = ()) -> Any:
     """Draw a camera to scale, with its lengths, as a Matplotlib figure.
 
     described : False leaves out the title and the table of the lens types, where both stand beside the drawing
+    curves : of lens types whose contrast is drawn against the place of the sensor
     """
     colours = {lens_type.name: COLOURS[index % len(COLOURS)] for index, lens_type in enumerate(camera.types)}
     terms = optical_terms(scene, camera)
     face = min(HIGHEST, max(LOWEST, NEAR_WIDTH / sensor_aspect(camera, terms)))
     key, above = (LINE * (len(camera.types) + 2.5), ABOVE) if described else (0.0, ABOVE - 2 * LINE)
-    height = above + SECTION + BETWEEN + face + BELOW + key
+    beneath = FOCUS + ABOVE if curves else 0.0
+    height = above + SECTION + BETWEEN + face + BELOW + key + beneath
     figure = new_figure(WIDTH, height)
 
     def axes(left: float, bottom: float, width: float, tall: float) -> Any:
         return figure.add_axes((left / WIDTH, bottom / height, width / WIDTH, tall / height))
 
-    section, lower = height - above - SECTION, BELOW + key
+    section, lower = height - above - SECTION, BELOW + key + beneath
     near, far = axes(LEFT, section, NEAR_WIDTH, SECTION), axes(FAR_LEFT, section, FAR_WIDTH, SECTION)
     _draw_section(near, far, scene, camera, colours)
     draw_sensor(axes(LEFT, lower, NEAR_WIDTH, face), camera, terms, colours)
     draw_sub_images(axes(FAR_LEFT, lower, FAR_WIDTH + 0.25, face), camera, terms, colours)
+    if curves:
+        _draw_curves(axes(LEFT, BELOW, FAR_LEFT + FAR_WIDTH - LEFT, FOCUS), curves, camera, colours)
     if not described:
         return figure
-    write_key(figure, camera, terms, colours, key - 1.5 * LINE, LINE)
+    write_key(figure, camera, terms, colours, beneath + key - 1.5 * LINE, LINE)
     name = printable_label(scene.title or scene.source.stem)
     figure.text(LEFT / WIDTH, 1 - 0.3 / height, name, fontsize=12, fontweight="bold", va="center")
     return figure
 
 
-def write_drawing(path: Path, scene: Scene, files: FigureFiles = SCREEN_PNG) -> list[Path]:
-    """Write the drawing of a scene's camera, and return its files. Raises InputError or MachineError."""
+def write_drawing(
+    path: Path, scene: Scene, files: FigureFiles = SCREEN_PNG, curves: Sequence[ThroughFocus] = ()
+) -> list[Path]:
+    """Write the drawing of a scene's camera, and return its files. Raises InputError or MachineError.
+
+    curves : as of `camera_drawing`
+    """
     for name in files.formats:
         if name not in FORMATS:
             raise InputError(f"--figure {path}: expected a file that ends in .{', .'.join(FORMATS)}, got '{path.name}'")
-    files.save(camera_drawing(scene, derive(scene)), path)
+    files.save(camera_drawing(scene, derive(scene), curves=curves), path)
     return files.paths(path)
+
+
+def _draw_curves(axes: Any, curves: Sequence[ThroughFocus], camera: Camera, colours: dict[str, str]) -> None:
+    """Draw contrast against the place of the sensor, for the axis and for the rim."""
+    for curve in curves:
+        colour = colours[curve.name]
+        axes.plot(1e3 * curve.shifts, curve.axis, color=colour, linewidth=1.4, label=f"{curve.name}, axis")
+        axes.plot(1e3 * curve.shifts, curve.rim, "--", color=colour, linewidth=1.2, label=f"{curve.name}, rim")
+    axes.axvline(0, color=GREY, linewidth=0.7)
+    axes.set_ylim(0, 1)
+    axes.set_xlim(*(1e3 * end for end in (min(c.shifts[0] for c in curves), max(c.shifts[-1] for c in curves))))
+    frequency = 1 / (4 * camera.pixel_pitch)
+    axes.set_title(f"contrast at {frequency:.3g} cycles/mm, half of Nyquist", fontsize=10, loc="left")
+    axes.set_xlabel("sensor moved away from the lens (µm)", fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.legend(fontsize=8, frameon=False, ncols=max(1, len(curves) // 4 + 1), loc="upper right")
 
 
 def _draw_section(near: Any, far: Any, scene: Scene, camera: Camera, colours: dict[str, str]) -> None:
@@ -249,7 +278,7 @@ def _cells(camera: Camera, lens_type: LensType, terms: LensTerms) -> tuple[str, 
         length_words(terms.total_track),
         f"{rows} x {columns} pixels",
         " x ".join(f"{angle:.3g}°" for angle in terms.field_of_view),
-        _airy_words(camera, terms),
+        _airy_words(camera, lens_type, terms),
     )
 
 
@@ -261,7 +290,7 @@ def _aperture_words(lens_type: LensType, terms: LensTerms) -> str:
     return "pinholes" if surfaces is None else f"{len(surfaces)} surfaces"
 
 
-def _airy_words(camera: Camera, terms: LensTerms) -> str:
+def _airy_words(camera: Camera, lens_type: LensType, terms: LensTerms) -> str:
     if terms.airy_diameter is None:
-        return "none"
+        return "none" if lens_type.optics.surfaces is None else ""  # that of surfaces is traced elsewhere
     return f"{terms.airy_diameter:.2g} pixels" + ("" if camera.wavelength else ", left out")

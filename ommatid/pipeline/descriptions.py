@@ -17,6 +17,7 @@ from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import derive
+from ommatid.scenes.geometry.optical_terms import ThroughFocus
 from ommatid.scenes.optics.negligible import ignores_detail
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
@@ -32,6 +33,17 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         lens_optics, light = optics(setup.camera), electrons(setup)
         world = {} if scene.world is None else {"world": check_world(setup).describe()}
     return summary.describe(setup, variant.choose(scene.render.variant), choice, lens_optics, light) | world
+
+
+def focus_curves(scene: Scene) -> list[ThroughFocus]:
+    """Return the contrast of lens types through focus. Raises InputError that names the scene file."""
+    camera = derive(scene)
+    if not camera.has_width:
+        return []
+    from ommatid.simulate.lenses.sharpness import through_focus
+
+    with naming_source(scene.source):
+        return through_focus(camera)
 
 
 def compare_lens_types(scene: Scene, magnifications: Sequence[Fraction], progress: Progress) -> DesignComparison:

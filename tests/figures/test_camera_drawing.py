@@ -14,6 +14,7 @@ from ommatid.figures.saving import FigureFiles, figure_formats, save_figure, svg
 from ommatid.figures.sensor_drawing import length_words
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.geometry.optical_terms import ThroughFocus
 from ommatid.scenes.scene import read
 
 from ..modules import ROOT
@@ -159,3 +160,19 @@ def words_of(path: Path) -> list[str]:
     root = ElementTree.parse(path).getroot()
     texts = (element.text.strip() for element in root.iter() if element.text and element.text.strip())
     return sorted(text for text in texts if not text.startswith("Matplotlib v"))
+
+
+def test_contrast_through_focus_is_drawn_where_there_are_curves() -> None:
+    """Solid on the axis and dashed at the rim, in the colour of the type; the title has half of Nyquist, 1 / 4 p."""
+    scene = read(Path("sensor"))
+    camera = derive(scene)
+    shifts = np.linspace(-0.1, 0.1, 5)
+    curves = [ThroughFocus("II", shifts, 1 - np.abs(shifts), 0.5 - shifts)]
+    without, drawn_axes = (camera_drawing(scene, camera, curves=each).axes for each in ([], curves))
+    assert len(drawn_axes) == len(without) + 1
+    axes = drawn_axes[-1]
+    solid, dashed = axes.lines[:2]
+    np.testing.assert_allclose(solid.get_xydata(), np.stack([100 * np.linspace(-1, 1, 5), curves[0].axis], axis=1))
+    np.testing.assert_allclose(dashed.get_ydata(), curves[0].rim)
+    assert (solid.get_linestyle(), dashed.get_linestyle()) == ("-", "--")
+    assert f"{1 / (4 * camera.pixel_pitch):.3g} cycles/mm" in axes.get_title(loc="left")

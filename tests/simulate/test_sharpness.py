@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import parse, read
 from ommatid.simulate.lenses import sharpness
 from ommatid.simulate.lenses.field import field_of
+from ommatid.simulate.lenses.point_spread import point_spread
 
 from ..examples import GALLERY
 
@@ -93,3 +95,38 @@ def test_quantities_that_no_lens_has_are_not_in_the_table() -> None:
     assert "Strehl ratio" in names
     assert "steered" not in names
     assert [name for name, _ in lens_rows([lens])] == ["magnification"]
+
+
+def test_a_thin_lens_through_focus_is_symmetric_and_agrees_with_a_displaced_focus() -> None:
+    """A sensor moved by s has the contrast of one that is focused at 1/F + s / depth^2."""
+    lens = "aperture=0.4 mm"
+    camera = thin(lens)
+    (curve,) = sharpness.through_focus(camera)
+    np.testing.assert_allclose(curve.axis, curve.axis[::-1], atol=1e-9)
+    np.testing.assert_allclose(curve.shifts, -curve.shifts[::-1])
+    depth = camera.depth(camera.types[0])
+    for number in (2, 7, 10):
+        focus = 1 / (1 / camera.distance - curve.shifts[number] / depth**2)
+        (found,) = sharpness.describe(thin(lens, f"focus={focus} mm"))
+        assert curve.axis[number] == pytest.approx(found["contrast_axis"], abs=1e-3)
+        assert curve.rim[number] == pytest.approx(found["contrast_rim"], abs=1e-3)
+
+
+@pytest.mark.slow
+def test_a_lens_of_surfaces_through_focus_agrees_with_waves_traced_to_a_moved_sensor() -> None:
+    camera = derive(read(GALLERY / "doublet.toml"))
+    kind = camera.types[0]
+    curve = sharpness.through_focus(camera)[0]
+    for number in (5, 8, 12):
+        moved = replace(field_of(camera, kind, camera.wavelength), depth=camera.depth(kind) + curve.shifts[number])
+        frequency = moved.depth / camera.distance / (4 * camera.pixel_pitch)  # which stays as it is on the sensor
+        along = np.array([[frequency, 0.0], [0.0, frequency]])
+        for height, contrast in ((0.0, curve.axis), (moved.field, curve.rim)):
+            traced = point_spread(moved.lit_wave(height, moved.outline(height).extent)).transfer(along).min()
+            assert contrast[number] == pytest.approx(traced, abs=0.01)
+
+
+@pytest.mark.parametrize("changes", [(), ("aperture=0.4 mm", "pixels=[60, 60]")])
+def test_pinholes_and_rays_have_no_curve(changes: tuple[str, ...]) -> None:
+    camera = thin(*changes)
+    assert sharpness.through_focus(replace(camera, wavelength=None)) == []

@@ -16,6 +16,8 @@ from fractions import Fraction
 from math import atan, degrees, sqrt
 from typing import Any
 
+from ommatid.runtime.arrays import FloatArray
+
 from ..camera import Camera
 from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
 from ..layout import sensor_extent
@@ -92,6 +94,20 @@ class OpticalTerms:
             "sensor_size": size,
             "sensor_share": self.sensor_share,
         }
+
+
+@dataclass(frozen=True)
+class ThroughFocus:
+    """Contrast of a lens type at half the sensor's Nyquist frequency against the place of the sensor.
+
+    shifts : (n,) of the sensor away from the lens, mm
+    axis, rim : (n,) contrast on the lens's axis and at the sensor point farthest from it, of the worse direction
+    """
+
+    name: str
+    shifts: FloatArray
+    axis: FloatArray
+    rim: FloatArray
 
 
 def optical_terms(scene: Scene, camera: Camera) -> OpticalTerms:

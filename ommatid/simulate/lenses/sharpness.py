@@ -17,15 +17,20 @@ from typing import Any
 
 import numpy as np
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
+from ommatid.scenes.geometry.optical_terms import ThroughFocus
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.distortion import field, undistort
 from ommatid.scenes.pose import poses
 
 from .field import LEAST_VERGENCE, LensField, field_of
-from .point_spread import point_spread, strehl_ratio
+from .point_spread import grid_of, point_spread, strehl_ratio
 from .wavefront import Wavefront
+
+FOCUS_STEPS = 21  # of a curve through focus
+FOCUS_ZEROS = 1.5  # its ends, times the shift N / frequency; a disk of rays has its first zero at 1.22
 
 
 def describe(camera: Camera) -> list[dict[str, Any]]:
@@ -95,14 +100,47 @@ def _at_height(camera: Camera, lens_type: LensType, height: float) -> dict[str, 
     field = field_of(camera, lens_type, wavelength)
     rays = field.wave(height, None)
     wave = None if wavelength is None or rays is None or field.rays_suffice else field.wave(height, wavelength)
-    frequency = depth / camera.distance / (4 * camera.pixel_pitch)  # half of Nyquist, on the target
-    along = np.array([[frequency, 0.0], [0.0, frequency]])
     return {
         "spot": None if rays is None else _spot(rays) * depth / camera.distance,
         "wavefront": None if wave is None else _wavefront_error(wave),
         "strehl": None if wave is None else strehl_ratio(wave),
-        "contrast": None if wave is None else float(point_spread(wave).transfer(along).min()),
+        "contrast": None if wave is None else _contrast(camera, depth, wave),
     }
+
+
+def _contrast(camera: Camera, depth: float, wave: Wavefront, grid: tuple[float, float] | None = None) -> float:
+    """Return the modulation transfer at half the sensor's Nyquist frequency, of the worse direction."""
+    frequency = depth / camera.distance / (4 * camera.pixel_pitch)  # on the target
+    return float(point_spread(wave, grid).transfer(np.array([[frequency, 0.0], [0.0, frequency]])).min())
+
+
+def through_focus(camera: Camera) -> list[ThroughFocus]:
+    """Return the curves of the lens types whose light is waves and reaches the rim."""
+    curves: list[ThroughFocus] = []
+    for lens_type in camera.types:
+        if lens_type.optics.is_pinhole or camera.wavelength is None:
+            continue
+        field, depth = field_of(camera, lens_type, camera.wavelength), camera.depth(lens_type)
+        if field.rays_suffice or field.wave(field.field, None) is None:
+            continue
+        last = FOCUS_ZEROS * 4 * camera.pixel_pitch * field.working_f_number
+        shifts = np.linspace(-last, last, FOCUS_STEPS)
+        contrasts = [_contrasts(camera, field, height, shifts / depth**2) for height in (0.0, field.field)]
+        curves.append(ThroughFocus(lens_type.name, shifts, *contrasts))
+    return curves
+
+
+def _contrasts(camera: Camera, field: LensField, height: float, vergences: FloatArray) -> FloatArray:
+    """Return the contrast of a lit sensor point at changes of its vergence: a quadratic phase over the pupil."""
+    rays = field.outline(height)
+    blur = field.pupil_radius * field.distance * float(np.abs(vergences).max())
+    half = rays.extent + blur
+    wave = field.lit_wave(height, half)
+    across = wave.cosines - (wave.cosines @ wave.light)[:, None]
+    bend = np.square(field.distance * across).sum(axis=0) / 2
+    grid = grid_of(wave)[0], half
+    moved = (replace(wave, path=wave.path - vergence * bend) for vergence in vergences)
+    return np.array([_contrast(camera, field.depth, each, grid) for each in moved])
 
 
 def _spot(rays: Wavefront) -> float:

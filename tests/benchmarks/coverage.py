@@ -30,7 +30,7 @@ FEW = "†"
 COLUMNS = (
     "cell",
     "runs",
-    "error / promised",
+    "error / Eq. 5",
     "error / expected",
     "inside",
     "chi-squared / expected",
@@ -109,13 +109,13 @@ def mean(values: Iterable[float]) -> tuple[float, float]:
 
 def ratios(reports: Sequence[RunReport]) -> tuple[list[float], list[float]]:
     """Return measured errors over those of Eq. 5, and over those expected for the image."""
-    promised, expected = list[float](), list[float]()
+    by_equation, expected = list[float](), list[float]()
     for error in (report.error for report in reports):
         if error.mse is not None and error.predicted_mse:
-            promised.append(error.mse / error.predicted_mse)
+            by_equation.append(error.mse / error.predicted_mse)
         if error.mse is not None and error.expected_given_truth is not None and error.expected_given_truth.mse:
             expected.append(error.mse / error.expected_given_truth.mse)
-    return promised, expected
+    return by_equation, expected
 
 
 def row(name: str, reports: Sequence[RunReport]) -> tuple[str, ...]:
@@ -188,8 +188,8 @@ def _described(cell: Cell, seeds: int) -> str:
 def _line(report: RunReport) -> str:
     place = {True: "inside", False: "OUTSIDE", None: "no interval"}[is_inside(report)]
     verdict = "red" if is_red(report) else "trusted"
-    promised = "".join(f"{ratio:.3f} of the promise, " for ratio in ratios([report])[0])
-    return f"error {report.error.mse:.4g}, {promised}{place}, {verdict}, {report.spent.seconds:.1f} s"
+    of_equation = "".join(f"{ratio:.3f} of Eq. 5, " for ratio in ratios([report])[0])
+    return f"error {report.error.mse:.4g}, {of_equation}{place}, {verdict}, {report.spent.seconds:.1f} s"
 
 
 def _with_error(values: Sequence[float]) -> str:

@@ -82,7 +82,7 @@ def test_h_of_a_defocused_lens_is_ten_times_better_known_than_its_entries() -> N
 
 
 @pytest.mark.slow
-def test_errors_of_h_f_are_as_large_as_promised() -> None:
+def test_errors_of_h_f_are_as_large_as_expected() -> None:
     """Of lenses that are focused elsewhere than the design says, so that all of their kernels are learnt."""
     camera, rng = defocused(), np.random.default_rng(1)
     other = with_optics({"aperture": "0.4 mm", "focus": "700 mm"}, {"wavelength": "none"}, ONE)[1]
@@ -92,8 +92,8 @@ def test_errors_of_h_f_are_as_large_as_promised() -> None:
         footprints = accepted(fit_kernels(drawn(truth, rng), camera, camera.types[0]))
         assert len(footprints.shapes.core)
         error = (footprints.to_sparse() - truth) @ image
-        promised = np.square(footprints.error_directions(image)).sum(axis=1)
-        ratios.append(float(np.square(error).mean() / promised.mean()))
+        expected = np.square(footprints.error_directions(image)).sum(axis=1)
+        ratios.append(float(np.square(error).mean() / expected.mean()))
     assert np.mean(ratios) == pytest.approx(1, abs=3 * float(np.std(ratios, ddof=1)) / len(ratios) ** 0.5)
 
 

@@ -335,7 +335,7 @@ def check_waves(lens_type: LensType, field: LensField) -> None:
         raise InputError(
             f"camera.lens.{lens_type.name}.surfaces: expected a spot of at most {MOST_RINGS:g} times the finest detail"
             f" of the light, got aberrations that spread it over {field.aberrated_rays:.3g}; reduce semi_diameter, or"
-            " take camera.wavelength = 'none' for rays, which promise more than such a lens can do"
+            " take camera.wavelength = 'none' for rays, whose image is sharper than that of such a lens"
         )
 
 

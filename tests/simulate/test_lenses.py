@@ -31,6 +31,8 @@ BIPLANE = [
     {"radius": "1.0333 mm", "thickness": "0.3 mm", "index": 1.5, "semi_diameter": "0.1 mm", "stop": True},
     {"semi_diameter": "0.2 mm"},
 ]
+# With 1024 samples most of the error behind such wide lenses is that of H, which is stated too large: docs/coverage.md.
+MANY = {"method": "transport", "samples": 32768}
 SENSOR = {"illuminance": "300 lux", "exposure": "10 ms", "read_noise": 3, "gain": 0.5, "black_level": 40, "prnu": 0.01}
 
 
@@ -52,7 +54,7 @@ def built(
         ({"aperture": "0.4 mm", "focus": "700 mm"}, {"noise": {"variance": 1.0}}),
         pytest.param({"distortion": [0.05, 0.0]}, {"noise": {"variance": 1.0}}, marks=pytest.mark.slow),
         pytest.param({"aperture": "0.4 mm", "focus": "900 mm"}, {"sensor": SENSOR}, marks=pytest.mark.slow),
-        pytest.param({"surfaces": BIPLANE[1:]}, {"sensor": SENSOR}, marks=pytest.mark.slow),
+        pytest.param({"surfaces": BIPLANE[1:]}, {"sensor": SENSOR, "calibration": MANY}, marks=pytest.mark.slow),
     ],
     ids=["defocus", "distortion", "sensor", "surfaces and sensor"],
 )

@@ -58,7 +58,13 @@ def _of(key: str, words: Callable[[Any], str]) -> tuple[str, Callable[[Lens], st
 
 
 def _axis_and_rim(key: str, words: Callable[[Any], str]) -> tuple[str, Callable[[Lens], str]]:
-    return f"{key}_axis", lambda lens: f"{words(lens[f'{key}_axis'])} / {words(lens[f'{key}_rim'])}"
+    def formatted(lens: Lens) -> str:
+        values = (
+            NO_LIGHT if lens[f"spot_{place}"] is None else words(lens[f"{key}_{place}"]) for place in ("axis", "rim")
+        )
+        return " / ".join(values)
+
+    return f"{key}_axis", formatted
 
 
 def _of_waves(key: str) -> tuple[str, Callable[[Lens], str]]:

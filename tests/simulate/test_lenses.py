@@ -142,4 +142,5 @@ def test_a_corner_without_light_has_no_spot_size() -> None:
     described_type = {"name": found["lens"], "magnification": "1/3"}
     rows = {row[0]: row[1] for row in lens_rows([described_type], [found])}
     assert rows["spot, rms um"].endswith("/ no light")
+    assert rows["sharpest at, mm"].endswith("/ no light")
     assert rows["distortion, %"] == "no light"

@@ -112,6 +112,16 @@ def test_a_thin_lens_through_focus_is_symmetric_and_agrees_with_a_displaced_focu
         assert curve.rim[number] == pytest.approx(found["contrast_rim"], abs=1e-3)
 
 
+def test_pixels_far_wider_than_the_light_s_detail_have_a_curve(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The zeros of a disk of rays would be a hundred waves away: the curve ends at 10."""
+    monkeypatch.setattr(sharpness, "FOCUS_STEPS", 3)
+    camera = replace(thin("aperture=0.99 mm"), wavelength=2e-5)
+    (curve,) = sharpness.through_focus(camera)
+    number = camera.depth(camera.types[0]) / 0.99
+    assert curve.shifts[-1] == pytest.approx(10 * 8 * 2e-5 * number**2)
+    assert int(np.argmax(curve.axis)) == curve.axis.size // 2
+
+
 @pytest.mark.slow
 def test_a_lens_of_surfaces_through_focus_agrees_with_waves_traced_to_a_moved_sensor() -> None:
     camera = derive(read(GALLERY / "doublet.toml"))

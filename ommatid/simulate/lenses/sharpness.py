@@ -22,7 +22,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
 from ommatid.scenes.geometry.optical_terms import ThroughFocus
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.distortion import field, undistort
+from ommatid.scenes.optics import distortion
 from ommatid.scenes.pose import poses
 
 from .field import LEAST_VERGENCE, LensField, field_of
@@ -31,6 +31,7 @@ from .wavefront import Wavefront
 
 FOCUS_STEPS = 21  # of a curve through focus
 FOCUS_ZEROS = 1.5  # its ends, times the shift N / frequency; a disk of rays has its first zero at 1.22
+FOCUS_WAVES = 10.0  # of defocus, at most at its ends
 
 
 def describe(camera: Camera) -> list[dict[str, Any]]:
@@ -123,7 +124,8 @@ def through_focus(camera: Camera) -> list[ThroughFocus]:
         field, depth = field_of(camera, lens_type, camera.wavelength), camera.depth(lens_type)
         if field.rays_suffice or field.wave(field.field, None) is None:
             continue
-        last = FOCUS_ZEROS * 4 * camera.pixel_pitch * field.working_f_number
+        number = field.working_f_number
+        last = min(FOCUS_ZEROS * 4 * camera.pixel_pitch * number, FOCUS_WAVES * 8 * camera.wavelength * number**2)
         shifts = np.linspace(-last, last, FOCUS_STEPS)
         contrasts = [_contrasts(camera, field, height, shifts / depth**2) for height in (0.0, field.field)]
         curves.append(ThroughFocus(lens_type.name, shifts, *contrasts))
@@ -178,9 +180,9 @@ def _distortion(camera: Camera, lens_type: LensType, rays: LensField) -> float |
         return None
     if given is not None:
         pairs = zip(camera.sub_imagers, poses(camera), strict=True)
-        limit = max(field(camera, sub, pose) for sub, pose in pairs if sub.type == lens_type)
+        limit = max(distortion.field(camera, sub, pose) for sub, pose in pairs if sub.type == lens_type)
         tangent, scale = height / rays.depth, camera.distance / camera.half_diagonal
-        return tangent / float(undistort(tangent, 0.0, *given, scale, limit)[0]) - 1
+        return tangent / float(distortion.undistort(tangent, 0.0, *given, scale, limit)[0]) - 1
     if lens_type.optics.surfaces is None:
         return 0.0
     seen = float(np.hypot(*rays.centre(np.zeros(1), np.array([height])))[0])

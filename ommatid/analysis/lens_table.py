@@ -25,11 +25,16 @@ def _length(millimetres: float | None) -> str:
 
 
 def _scaled(scale: float, digits: str = ".3g") -> Callable[[float | None], str]:
-    return lambda value: NO_LIGHT if value is None else format(value * scale, digits)
+    def formatted(value: float | None) -> str:
+        if value is None:
+            return NO_LIGHT
+        return format(value * scale, digits if abs(value * scale) < 1000 else ".0f")
+
+    return formatted
 
 
-def _product(pair: Sequence[float]) -> str:
-    return " x ".join(f"{number:.3g}" for number in pair)
+def _product(pair: Sequence[int]) -> str:
+    return f"{pair[0]} x {pair[1]}"
 
 
 def _ratio(magnification: float) -> str:

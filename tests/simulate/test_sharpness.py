@@ -97,6 +97,11 @@ def test_quantities_that_no_lens_has_are_not_in_the_table() -> None:
     assert [name for name, _ in lens_rows([lens])] == ["magnification"]
 
 
+def test_thousands_in_the_table_are_whole_numbers() -> None:
+    rows = lens_rows([{"name": "I", "pixels": [1019, 340], "airy_diameter": 1.2344, "sub_image_width": 0.1234}])
+    assert rows == [("pixels of each", "1019 x 340"), ("width of each, mm", "0.123"), ("Airy disk, um", "1234")]
+
+
 def test_a_thin_lens_through_focus_is_symmetric_and_agrees_with_a_displaced_focus() -> None:
     """A sensor moved by s has the contrast of one that is focused at 1/F + s / depth^2."""
     lens = "aperture=0.4 mm"

@@ -71,11 +71,6 @@ class LensField(ABC):
     def working_f_number(self) -> float:
         """Ratio of length to width of the cone of light at the sensor."""
 
-    @property
-    @abstractmethod
-    def exit_solid_angle(self) -> float:
-        """Projected solid angle of the disk over which rays leave evenly, seen from the sensor's middle, sr."""
-
     @cached_property
     def _rays(self) -> tuple[FloatArray, list[Wavefront]]:
         """Heights that get light, the least of them 0, and their rays."""
@@ -102,10 +97,6 @@ class LensField(ABC):
         """Return the light at sensor points as a projected solid angle, sr; 0 where none arrives."""
         heights, waves = self._rays
         return np.interp(height, heights, [wave.brightness for wave in waves], right=0.0)
-
-    def lit_share(self, height: FloatArray) -> FloatArray:
-        """Return the mean weight of rays that leave evenly spread over the exit disk, as `trace` gives it."""
-        return self.brightness(height) / self.exit_solid_angle
 
     @property
     def pupil_radius(self) -> float:
@@ -243,10 +234,9 @@ class SurfaceField(LensField):
         """Ratio of length to width of the cone of light at the sensor."""
         return self.prescription.working_f_number(self.depth)
 
-    @property
-    def exit_solid_angle(self) -> float:
-        """Projected solid angle of the exit disk, seen from the sensor's middle, sr."""
-        return pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2
+    def lit_share(self, height: FloatArray) -> FloatArray:
+        """Return the mean weight of rays that leave evenly spread over the exit disk, as `trace` gives it."""
+        return self.brightness(height) / (pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,11 +264,6 @@ class ThinField(LensField):
     def working_f_number(self) -> float:
         """Ratio of length to width of the cone of light at the sensor."""
         return self.depth / self.aperture
-
-    @property
-    def exit_solid_angle(self) -> float:
-        """Projected solid angle of the lens, seen from the sensor's middle, sr."""
-        return pi * (self.aperture / (2 * self.depth)) ** 2
 
 
 def _lit(wave: Wavefront | None, height: float) -> Wavefront:
@@ -344,20 +329,26 @@ def bands(camera: Camera) -> tuple[tuple[float | None, float], ...]:
     return camera.wavelengths or ((None, 1.0),)
 
 
-@lru_cache(maxsize=16)
 def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> LensField:
-    """Return a lens type of the camera at a wavelength. Expects no pinhole.
+    """Return a lens type of the camera, which is no pinhole, at a wavelength. Raises as `surface_field` does."""
+    if lens_type.optics.surfaces is not None:
+        return surface_field(camera, lens_type, wavelength)
+    if lens_type.optics.aperture is None:
+        raise ValueError(f"lens type '{lens_type.name}' is a pinhole, expected a lens")
+    depth, (far, _, _) = camera.depth(lens_type), reach(camera, lens_type)
+    return ThinField(depth, camera.distance, far, wavelength, lens_type.optics.aperture, camera.focus(lens_type))
 
-    A lens of surfaces is scaled and placed as at the camera's wavelength; another one changes the glass alone, so that
-    principal planes move and the distances from them with them. Raises InputError if the surfaces form no image.
+
+@lru_cache(maxsize=16)
+def surface_field(camera: Camera, lens_type: LensType, wavelength: float | None) -> SurfaceField:
+    """Return a lens type of surfaces at a wavelength.
+
+    The lens is scaled and placed as at the camera's wavelength; another one changes the glass alone, so that principal
+    planes move and the distances from them with them. Raises InputError if the surfaces form no image.
     """
     (far, _, _), depth, distance = reach(camera, lens_type), camera.depth(lens_type), camera.distance
-    if lens_type.optics.surfaces is None:
-        if lens_type.optics.aperture is None:
-            raise ValueError(f"lens type '{lens_type.name}' is a pinhole, expected a lens")
-        return ThinField(depth, distance, far, wavelength, lens_type.optics.aperture, camera.focus(lens_type))
     lens = prescription_of(camera, lens_type)
-    if wavelength is not None and wavelength != camera.wavelength:
+    if wavelength is not None and wavelength != camera.wavelength and lens_type.optics.surfaces is not None:
         other = replace(lens, index=prescribe(lens_type.optics.surfaces, wavelength).index)
         depth += lens.rear_principal - other.rear_principal
         distance += other.front_principal - lens.front_principal

@@ -90,7 +90,7 @@ def _described(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "curvature": bend,
         **{f"{name}_axis": value for name, value in axis.items()},
         **{f"{name}_rim": value for name, value in rim.items()},
-        "distortion": _distortion(camera, lens_type, rays),
+        "distortion": None if rim["spot"] is None else _distortion(camera, lens_type, rays),
         "illumination": float(rays.brightness(np.array([rays.field]))[0] / rays.brightness(np.zeros(1))[0]),
     }
 
@@ -173,11 +173,9 @@ def _distance(vergence: float | None) -> float | None:
     return 1 / vergence if vergence is not None and vergence > LEAST_VERGENCE else None
 
 
-def _distortion(camera: Camera, lens_type: LensType, rays: LensField) -> float | None:
-    """Return the relative change of the magnification at the rim."""
+def _distortion(camera: Camera, lens_type: LensType, rays: LensField) -> float:
+    """Return the relative change of the magnification at the rim, which gets light."""
     given, height = lens_type.optics.distortion, rays.field
-    if rays.wave(height, None) is None:
-        return None
     if given is not None:
         pairs = zip(camera.sub_imagers, poses(camera), strict=True)
         limit = max(distortion.field(camera, sub, pose) for sub, pose in pairs if sub.type == lens_type)

@@ -17,7 +17,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
-from ..lenses.field import LensField, bands, check_waves, field_of, sampling_tables
+from ..lenses.field import SurfaceField, bands, check_waves, sampling_tables, surface_field
 from ..lenses.prescription import prescription_of
 from ..lenses.ray_trace import Functions, exit_disk_of, path, reach, trace
 from ..lenses.wavefront import GRID_REACH
@@ -63,7 +63,7 @@ class RealLens(LensModel):
 class WaveLens(RealLens):
     """A lens of surfaces, whose light is waves of one or several wavelengths."""
 
-    def __init__(self, camera: Camera, lens_type: LensType, fields: list[tuple[LensField, float]]) -> None:
+    def __init__(self, camera: Camera, lens_type: LensType, fields: list[tuple[SurfaceField, float]]) -> None:
         """Create the model of a lens type with its fields at the wavelengths of the light, and their shares."""
         super().__init__(camera, lens_type)
         self._fields, self._depth, self._vergence = fields, camera.depth(lens_type), 1 / camera.distance
@@ -131,7 +131,7 @@ class WaveLens(RealLens):
 class _Band:
     """The tables of a lens type at one wavelength, whose share of the light is `share`."""
 
-    def __init__(self, field: LensField, share: float, ends: list[float], cells: int, beyond: float) -> None:
+    def __init__(self, field: SurfaceField, share: float, ends: list[float], cells: int, beyond: float) -> None:
         """Tabulate the slopes between two vergences of the target, or at one if these are the same."""
         import mitsuba as mi
 
@@ -200,7 +200,7 @@ def real_lens(camera: Camera, lens_type: LensType) -> LensModel:
 
     Raises InputError if the surfaces form no image or pass no light.
     """
-    fields = [(field_of(camera, lens_type, wavelength), share) for wavelength, share in bands(camera)]
+    fields = [(surface_field(camera, lens_type, wavelength), share) for wavelength, share in bands(camera)]
     for field, _ in fields:
         check_waves(lens_type, field)
     if any(field.rays_suffice for field, _ in fields):

@@ -213,6 +213,14 @@ def test_the_bits_of_the_chosen_camera(phone: str) -> None:
     check_figures("choose-a-camera.md", "11 bits would seem enough, with {} grey levels", rays**0.5)
 
 
+def test_the_heights_before_one_chip() -> None:
+    camera = derive(ommatid.read_scene("tile35", set="camera.common=sensor"))
+    fifth = next(lens_type for lens_type in camera.types if lens_type.ratio == 5)
+    lengths = camera.height(fifth), camera.depth(fifth)
+    check_figures("camera.md", "Lenses of 1/5 then stand {} mm behind those of 1/3, at {} mm before the chip", *lengths)
+    check_figures("camera.md", "their `focus`, where it is not given, is {} mm", camera.focus(fifth))
+
+
 def test_one_lens_type_against_three() -> None:
     def row(lens: str) -> list[float]:
         found = ommatid.predict(ommatid.read_scene("tile19", set="noise.variance=1e-2", lens=lens), rays=False)

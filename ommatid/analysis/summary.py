@@ -51,7 +51,7 @@ def describe(
             "distance": camera.distance,
         },
         "light_as": _light_words(camera),
-        "camera": terms.describe(),
+        "camera": terms.describe() | {"common": scene.camera.common},
         "lens_types": [
             _lens_type(camera, lens_type) | lens.describe()
             for lens_type, lens in zip(camera.types, terms.types, strict=True)
@@ -149,7 +149,7 @@ def sections(description: dict[str, Any]) -> list[Section]:
         ("target", f"{target['rows']} x {target['columns']} pixels, {target['height']:g} x {target['width']:g} mm"),
         ("distance", f"{target['distance']:g} mm"),
         ("light", description["light_as"]),
-        *_camera_rows(description["camera"]),
+        *_camera_rows(description),
         ("measurements", f"{description['measurements']} for {description['unknowns']} unknowns"),
     ]
     if description["pixels_seen_by_fewer_types"]:
@@ -178,8 +178,9 @@ def skipped_words(why: str, bound: float | None) -> str:
     return why if bound is None else f"{why}; no measurement changes by more than {bound:.2g}"
 
 
-def _camera_rows(camera: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return lenses and sensor area; the size of the sensor where the scene gives it."""
+def _camera_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return lenses, their planes and sensor area; the size of the sensor where the scene gives it."""
+    camera = description["camera"]
     height, width = camera["sensor_extent"]
     area = f"{camera['sensor_area']:.3g} mm² of pixels, in {height:.4g} x {width:.4g} mm (height x width)"
     if camera["sensor_size"] is not None:
@@ -191,8 +192,19 @@ def _camera_rows(camera: dict[str, Any]) -> list[tuple[str, str]]:
         )
     return [
         ("lenses", f"{camera['lenses']}, total track {camera['total_track']:.4g} mm"),
+        *_planes_rows(camera["common"], [lens["sensor_depth"] for lens in description["lens_types"]]),
         ("sensor area", area),
     ]
+
+
+def _planes_rows(common: str, depths: Sequence[float]) -> list[tuple[str, str]]:
+    """Return what lies in one plane in a camera of several depths; nothing if there is a single one."""
+    if min(depths) == max(depths):
+        return []
+    ends = f"{min(depths):.4g} to {max(depths):.4g} mm"
+    if common == "sensor":
+        return [("planes", f"one of the sensor, lenses {ends} before it")]
+    return [("planes", f"one of the lenses, sensors {ends} behind it")]
 
 
 def light_rows(light: dict[str, Any]) -> list[tuple[str, str]]:

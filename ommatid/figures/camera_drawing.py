@@ -101,7 +101,7 @@ def _draw_curves(axes: Any, curves: Sequence[ThroughFocus], camera: Camera, colo
 
 def _draw_section(near: Any, far: Any, scene: Scene, camera: Camera, colours: dict[str, str]) -> None:
     """Draw the camera and the target from above, on axes of their own, and the light of one sub-imager per type."""
-    deepest = max(camera.depth(lens_type) for lens_type in camera.types)
+    deepest = max(camera.height(lens_type) + camera.depth(lens_type) for lens_type in camera.types)
     for sub in {(sub.type.name, sub.lens[0], sub.patch[0]): sub for sub in camera.sub_imagers}.values():
         _draw_sub_imager(near, camera, sub, colours[sub.type.name])
     ends = [edge for sub in camera.sub_imagers for edge in (sub.lens[0], *_patch_edges(camera, sub))]
@@ -114,31 +114,38 @@ def _draw_section(near: Any, far: Any, scene: Scene, camera: Camera, colours: di
         for axes in (near, far):
             for ray in light:
                 axes.plot(*zip(*ray, strict=True), color=colours[lens_type.name], linewidth=0.9, alpha=0.85)
-    near.set_xlim(-deepest * (1 + 2 * AIR), deepest * NEAR)
+    room = 2 if camera.sensor_distance is None else 3  # for the names of all types beside one sensor
+    near.set_xlim(-deepest * (1 + room * AIR), deepest * NEAR)
     near.set_ylim(low, high)
     _draw_target(far, scene, camera)
     _label(near, "camera from above, and light of one sub-imager of each type", "left")
     _label(far, "target", "right")
-    _mark_break(near, far, camera.distance)
+    _mark_break(near, far, camera)
     write_beside(near, "lenses", (0, high), (4, -4), va="top", fontsize=8)
     write_beside(near, "sensor", (-deepest, high), (-4, -4), va="top", fontsize=8)
     for lens_type in camera.types:
         sub = _middle(camera, lens_type)
         words = f"{lens_type.name}: {length_words(sub.depth, 3)}"
-        place = -sub.depth, sub.patch[0]
+        place = _planes(camera, sub)[0], sub.patch[0]
         write_beside(near, words, place, (-6, 0), va="center", fontsize=8, color=colours[lens_type.name])
 
 
 def _draw_sub_imager(axes: Any, camera: Camera, sub: SubImager, colour: str) -> None:
-    """Draw a lens at z = 0, a pinhole as a dot, and its patch of the sensor behind it."""
-    edges = _patch_edges(camera, sub)
-    axes.plot([-sub.depth] * 2, edges, color=colour, linewidth=3.5, solid_capstyle="butt")
+    """Draw a lens, a pinhole as a dot, and its patch of the sensor behind it."""
+    edges, (sensor, z) = _patch_edges(camera, sub), _planes(camera, sub)
+    axes.plot([sensor] * 2, edges, color=colour, linewidth=3.5, solid_capstyle="butt")
     aperture, x = sub.type.optics.aperture, sub.lens[0]
     if aperture is None:
-        axes.plot([0], [x], "o", color=colour, markersize=3)
+        axes.plot([z], [x], "o", color=colour, markersize=3)
     else:
         arrow = {**ARROW, "color": colour, "linewidth": 1.2, "mutation_scale": 5}
-        axes.annotate("", (0, x - aperture / 2), (0, x + aperture / 2), arrowprops=arrow)
+        axes.annotate("", (z, x - aperture / 2), (z, x + aperture / 2), arrowprops=arrow)
+
+
+def _planes(camera: Camera, sub: SubImager) -> tuple[float, float]:
+    """Return the z of a sub-imager's patch and of its lens."""
+    z = camera.distance - sub.distance
+    return z - sub.depth, z
 
 
 def _patch_edges(camera: Camera, sub: SubImager) -> tuple[float, float]:
@@ -153,21 +160,27 @@ def _middle(camera: Camera, lens_type: LensType) -> SubImager:
 
 def _light(camera: Camera, sub: SubImager) -> list[Ray]:
     """Return the straight rays from both edges of a patch through the middle of the lens to the target."""
-    x = sub.lens[0]
+    x, (sensor, z) = sub.lens[0], _planes(camera, sub)
     return [
-        ((-sub.depth, edge), (0.0, x), (camera.distance, x + (x - edge) * camera.distance / sub.depth))
+        ((sensor, edge), (z, x), (camera.distance, x + (x - edge) * sub.distance / sub.depth))
         for edge in _patch_edges(camera, sub)
     ]
 
 
 def _draw_walls(axes: Any, camera: Camera) -> None:
-    """Draw the walls between neighbouring columns of lenses, down to the shallower sensor of the two."""
-    places = sorted({(sub.lens[0], sub.depth) for sub in camera.sub_imagers})
+    """Draw the walls between neighbouring columns of lenses, from the lens in front to the shallower sensor."""
+    places = sorted({(sub.lens[0], *_planes(camera, sub)) for sub in camera.sub_imagers})
     if len(places) > MOST_WALLS:
         return
-    for (x, depth), (other, other_depth) in pairwise(places):
+    for (x, sensor, z), (other, other_sensor, other_z) in pairwise(places):
         if other > x:
-            axes.plot([0, -min(depth, other_depth)], [(x + other) / 2] * 2, color=GREY, linewidth=0.5, alpha=0.7)
+            axes.plot(
+                [max(z, other_z), max(sensor, other_sensor)],
+                [(x + other) / 2] * 2,
+                color=GREY,
+                linewidth=0.5,
+                alpha=0.7,
+            )
 
 
 def _draw_target(axes: Any, scene: Scene, camera: Camera) -> None:
@@ -183,7 +196,7 @@ def _draw_target(axes: Any, scene: Scene, camera: Camera) -> None:
     axes.text(0.03, 0.03, f"{what}{size}:\n{grid}", transform=axes.transAxes, fontsize=8, va="bottom")
 
 
-def _mark_break(near: Any, far: Any, distance: float) -> None:
+def _mark_break(near: Any, far: Any, camera: Camera) -> None:
     """Mark where the axis is broken, with the ratios of the scales, and the distance from the lenses to the target."""
     from matplotlib.patches import ConnectionPatch
 
@@ -208,9 +221,10 @@ def _mark_break(near: Any, far: Any, distance: float) -> None:
     )
     systems = near.get_xaxis_transform(), far.get_xaxis_transform()
     figure.add_artist(
-        ConnectionPatch((0, 1.05), (distance, 1.05), *systems, axesA=near, axesB=far, mutation_scale=9, **ARROW)
+        ConnectionPatch((0, 1.05), (camera.distance, 1.05), *systems, axesA=near, axesB=far, mutation_scale=9, **ARROW)
     )
-    words = f"{length_words(distance)} from lenses to target"
+    lenses = "lenses" if camera.sensor_distance is None else "foremost lenses"
+    words = f"{length_words(camera.distance)} from {lenses} to target"
     figure.text(middle, before.y1 + 0.17 / figure.get_figheight(), words, ha="center", va="bottom", fontsize=9)
 
 

@@ -111,9 +111,7 @@ def positions(camera: Camera, sub: SubImager, rows: FloatArray, columns: FloatAr
     pose = pose_of(sub)
     x = (camera.columns / 2 - columns - 0.5) * camera.target_pitch - pose.lens[0]
     y = (camera.rows / 2 - rows - 0.5) * camera.target_pitch - pose.lens[1]
-    tangents = distort(
-        x / camera.distance, y / camera.distance, *coefficients(sub), camera.distance / camera.half_diagonal
-    )
+    tangents = distort(x / sub.distance, y / sub.distance, *coefficients(sub), sub.distance / camera.half_diagonal)
     points = [-sub.depth * tangent - middle for tangent, middle in zip(tangents, pose.middle, strict=False)]
     u, v = pose.axes[:2].T @ np.stack(points)
     corner_u, corner_v = corner_offset(camera, sub)

@@ -1,6 +1,6 @@
 """Geometry of a flat camera: one sensor behind arrays of micro-lenses, looking at a flat target.
 
-Lengths are millimetres. The camera looks along +z from the plane of the lenses, z = 0, with +y up, so the
+Lengths are millimetres. The camera looks along +z from the plane of the foremost lenses, z = 0, with +y up, so the
 columns of an upright image run towards -x and its rows towards -y. Positions on the target called `row` and
 `column` are in pixels of the target, f, from its top left corner. The order of measurements everywhere: lens
 types as listed, sub-imagers (k, l) by rows, then pixels by rows.
@@ -41,6 +41,8 @@ class Camera:
     detail : the world's grid is so many times finer than f
     wavelength : the mean, if there are several;  bands : each wavelength and the share of electrons that it frees
     walls : False if light of every lens reaches every patch
+    distance : from the foremost lenses to the target
+    sensor_distance : from one sensor behind all lenses to the target; None if all lenses stand in one plane
     """
 
     rows: int
@@ -56,6 +58,7 @@ class Camera:
     detail: int = 1
     bands: tuple[tuple[float, float], ...] = ()
     walls: bool = True
+    sensor_distance: float | None = None
 
     @property
     def wavelengths(self) -> tuple[tuple[float, float], ...]:
@@ -103,9 +106,28 @@ class Camera:
         """M, number of sensor pixels of all sub-imagers."""
         return sum(lens_type.measurements for lens_type in self.types)
 
+    def distance_of(self, lens_type: LensType) -> float:
+        """Distance from a type's lenses to the target.
+
+        In front of one sensor it is the one whose image has the type's magnification: their distances from the sensor
+        and from the target have the ratio of the magnification and the same sum.
+        """
+        if self.sensor_distance is None:
+            return self.distance
+        magnification = self.pixel_pitch / (float(lens_type.ratio) * self.target_pitch)
+        return self.sensor_distance / (1 + magnification)
+
+    def height(self, lens_type: LensType) -> float:
+        """Distance of a type's lenses behind the foremost ones."""
+        return self.distance_of(lens_type) - self.distance
+
     def depth(self, lens_type: LensType) -> float:
-        """Distance of a type's sensor behind its lenses: its magnification times the target's distance."""
-        return self.distance * self.pixel_pitch / (float(lens_type.ratio) * self.target_pitch)
+        """Distance of a type's sensor behind its lenses: its magnification times the target's distance from them."""
+        return self.distance_of(lens_type) * self.pixel_pitch / (float(lens_type.ratio) * self.target_pitch)
+
+    def optical_magnification(self, lens_type: LensType) -> float:
+        """Magnification of a type's image on the sensor, in lengths."""
+        return self.depth(lens_type) / self.distance_of(lens_type)
 
     def focal_length(self, lens_type: LensType) -> float:
         """Focal length by the thin-lens equation, 1/focal_length = 1/focus + 1/depth."""
@@ -113,7 +135,7 @@ class Camera:
 
     def focus(self, lens_type: LensType) -> float:
         """Distance at which a type's lenses are in focus."""
-        return self.distance if lens_type.optics.focus is None else lens_type.optics.focus
+        return self.distance_of(lens_type) if lens_type.optics.focus is None else lens_type.optics.focus
 
     @property
     def has_width(self) -> bool:
@@ -179,7 +201,7 @@ class Camera:
         """True if a point of the target is imaged as more than a point: by surfaces, defocus or diffraction."""
         if lens_type.optics.aperture is None:
             return lens_type.optics.surfaces is not None
-        return self.wavelength is not None or self.focus(lens_type) != self.distance
+        return self.wavelength is not None or self.focus(lens_type) != self.distance_of(lens_type)
 
     @property
     def has_sharp_footprints(self) -> bool:
@@ -235,9 +257,10 @@ class Camera:
         lens_y = ((rows - 1) / 2 - above - k) * self.lens_pitch
         view = lens_type.view(k, l)
         x, y = self.position(*lens_type.middle(view.window))
-        depth, shrink = self.depth(lens_type), self.depth(lens_type) / self.distance
+        distance, depth = self.distance_of(lens_type), self.depth(lens_type)
+        shrink = self.optical_magnification(lens_type)
         patch = lens_x + (lens_x - x) * shrink, lens_y + (lens_y - y) * shrink
-        return SubImager(lens_type, k, l, view.window, (lens_x, lens_y), patch, depth, view.rotation)
+        return SubImager(lens_type, k, l, view.window, (lens_x, lens_y), patch, depth, distance, view.rotation)
 
     @cached_property
     def on_grids(self) -> Camera:
@@ -301,6 +324,7 @@ class Camera:
         bands = [list(band) for band in self.bands] or None
         optional = ("target.detail", self.detail, 1), ("camera.wavelength", self.wavelength, None)
         optional += ("camera.bands", bands, None), ("camera.walls", self.walls, True)
+        optional += (("camera.sensor_distance", self.sensor_distance, None),)
         description |= {key: value for key, value, default in optional if value != default}
         if self.tolerance is not None:
             description["camera.tolerance"] = self.tolerance.model_dump(mode="json")
@@ -326,6 +350,7 @@ def derive(scene: Scene) -> Camera:
         detail=scene.target.detail,
         bands=bands,
         walls=scene.camera.walls,
+        sensor_distance=scene.sensor_distance,
     )
     check_counts(types, scene.source)
     needed = PLANES * 8 * (camera.world.unknowns + camera.measurements)

@@ -260,7 +260,8 @@ class SubImager:
     """One lens and the sensor patch behind it.
 
     window : row and column of f where its view begins
-    lens, patch : (x, y) of their centres;  depth : distance from the lens to the patch;  rotation : of the patch
+    lens, patch : (x, y) of their centres;  rotation : of the patch
+    depth, distance : from the lens to the patch, and to the target
     """
 
     type: LensType
@@ -270,6 +271,7 @@ class SubImager:
     lens: tuple[float, float]
     patch: tuple[float, float]
     depth: float
+    distance: float
     rotation: float = 0.0
 
     @property

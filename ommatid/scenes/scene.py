@@ -147,6 +147,18 @@ class Scene(Table):
         return self._allow_outside or self._world_copy is not None
 
     @property
+    def sensor_distance(self) -> float | None:
+        """Distance in mm from one sensor of all lens types to the target; None if the lenses stand in one plane.
+
+        `target.distance` is that of the foremost lenses, which have the largest magnification.
+        """
+        camera, target = self.camera, self.target
+        if camera.common == "lenses":
+            return None
+        largest = max(float(lens.magnification) for lens in camera.lens)
+        return target.distance * (1 + largest * camera.pixel_pitch / target.pixel_pitch)
+
+    @property
     def assumed_prior(self) -> PriorTable:
         """The prior that the estimator assumes: [prior], with estimator.prior_variance where it is set."""
         variance = self.estimator.prior_variance

@@ -98,4 +98,6 @@ def _diffraction_reach(camera: Camera, lens_type: LensType) -> float:
 
     depth = camera.depth(lens_type)
     working = prescription_of(camera, lens_type).working_f_number(depth)
-    return GRID_REACH * (camera.wavelength or 0.0) * working * camera.distance / depth / camera.target_pitch
+    return (
+        GRID_REACH * (camera.wavelength or 0.0) * working * camera.distance_of(lens_type) / depth / camera.target_pitch
+    )

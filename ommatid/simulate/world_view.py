@@ -233,7 +233,7 @@ def views(camera: Camera) -> tuple[FloatArray, FloatArray]:
         down, across = np.meshgrid(shares * rows, shares * columns, indexing="ij")
         x = (camera.columns / 2 - float(sub.window[1]) - across.ravel()) * camera.target_pitch
         y = (camera.rows / 2 - float(sub.window[0]) - down.ravel()) * camera.target_pitch
-        start = np.tile([*sub.lens, 0.0], (x.size, 1))
+        start = np.tile([*sub.lens, camera.distance - sub.distance], (x.size, 1))
         origins.append(start)
         directions.append(np.stack([x, y, np.full(x.size, camera.distance)], axis=1) - start)
     return np.concatenate(origins), np.concatenate(directions)
@@ -249,7 +249,9 @@ def ideal_camera(camera: Camera, finer: int = 1) -> Camera:
         (Fraction(1), Fraction(1)),
         (0, 0),
     )
-    return replace(camera, types=(lens_type,), wavelength=None, tolerance=None, lens_columns=None, walls=True)
+    return replace(
+        camera, types=(lens_type,), wavelength=None, tolerance=None, lens_columns=None, walls=True, sensor_distance=None
+    )
 
 
 def coarse_camera(camera: Camera) -> Camera:

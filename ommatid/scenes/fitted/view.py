@@ -48,7 +48,7 @@ def designed(sub: SubImager) -> FloatArray:
 def misaligned(camera: Camera, sub: SubImager, error: Misalignment) -> FloatArray:
     """Return the numbers of a misaligned sub-imager; tilt, which they do not describe, is ignored."""
     numbers = designed(sub)
-    far = camera.distance / sub.depth
+    far = sub.distance / sub.depth
     for number, axis in ((COLUMN, 0), (ROW, 1)):
         aside = sub.lens[axis] - sub.patch[axis]
         view = error.position[axis] + (aside + error.position[axis]) * far / (1 + error.focal_length) - aside * far
@@ -59,7 +59,7 @@ def misaligned(camera: Camera, sub: SubImager, error: Misalignment) -> FloatArra
 
 def misalignment(camera: Camera, sub: SubImager, numbers: FloatArray) -> Misalignment:
     """Return the misalignment that has these numbers; the inverse of `misaligned`."""
-    far = camera.distance / sub.depth
+    far = sub.distance / sub.depth
     lever = far / (1 + numbers[MAGNIFICATION])
     x, y = (
         (-numbers[number] * camera.target_pitch - (sub.lens[axis] - sub.patch[axis]) * (lever - far)) / (1 + lever)
@@ -113,7 +113,7 @@ def displacements(
 def scales(camera: Camera, sub: SubImager) -> FloatArray:
     """Return the changes of the numbers that move the edge of a view by about a pixel of f: (5,)."""
     half = float(sub.type.ratio) * hypot(*sub.type.pixels) / 2
-    aside = hypot(sub.lens[0] - sub.patch[0], sub.lens[1] - sub.patch[1]) * camera.distance / sub.depth
+    aside = hypot(sub.lens[0] - sub.patch[0], sub.lens[1] - sub.patch[1]) * sub.distance / sub.depth
     furthest = half + aside / camera.target_pitch
     corner = camera.half_diagonal / camera.target_pitch
     return np.array([1.0, 1.0, 1 / half, 1 / half, corner**2 / furthest**3])

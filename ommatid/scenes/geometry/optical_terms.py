@@ -136,7 +136,7 @@ def _lens_terms(camera: Camera, lens_type: LensType, wavelength: float) -> LensT
     return LensTerms(
         name=lens_type.name,
         grid_magnification=1 / lens_type.ratio,
-        magnification=depth / camera.distance,
+        magnification=camera.optical_magnification(lens_type),
         focal_length=focal_length,
         aperture=aperture,
         f_number=None if aperture is None else focal_length / aperture,

@@ -5,8 +5,10 @@ the sensor, of pitch s, then spans Z s / d of a target at distance Z, which is 1
 
     magnification = d p / (Z s),   field of view = 2 atan(pixels s / (2 d)),   f-number = f / aperture.
 
-F is Z unless the lens has a focus of its own. Each equation gives the one of its quantities that is absent from the
-others. Quantities are exact fractions of the decimal numbers in the file, lengths in millimetres.
+F is Z unless the lens has a focus of its own. In front of one sensor (camera.common) Z differs between lens types, and
+Z + d is the same for all; target.distance is the Z of the type with the largest d. Each equation gives the one of its
+quantities that is absent from the others. Quantities are exact fractions of the decimal numbers in the file, lengths in
+millimetres.
 
 A redundant key must agree with the geometry that the others give. A number counts as given to its last digit, and to
 three digits at least: 2 mm stands for 1.995 to 2.005 mm. Numbers of more than six digits agree to a millionth.
@@ -49,7 +51,7 @@ def contradiction(lens: Mapping[str, Any], known: Mapping[str, Fraction]) -> str
     if "focal_length" in lens and not _agree(lens["focal_length"], known["focal_length"], focal_length):
         return (
             f"{where}.focal_length: got {lens['focal_length']}, but magnification {known['magnification']},"
-            f" target.distance {_mm(known['distance'])}, target.pixel_pitch {_mm(known['target_pitch'])} and"
+            f" {_distance_words(known)}, target.pixel_pitch {_mm(known['target_pitch'])} and"
             f" camera.pixel_pitch {_mm(known['sensor_pitch'])} make it {_mm(focal_length)}; remove or correct one of"
             " these keys"
         )
@@ -94,6 +96,11 @@ def _view_contradiction(lens: Mapping[str, Any], where: str, known: Mapping[str,
                 " correct one of these keys"
             )
     return ""
+
+
+def _distance_words(known: Mapping[str, Fraction]) -> str:
+    words = "target.distance" if "whole" not in known else "a distance from the target, before one sensor, of"
+    return f"{words} {_mm(known['distance'])}"
 
 
 def _too_large(where: str, known: Mapping[str, Fraction]) -> str:
@@ -153,7 +160,16 @@ def complete(data: dict[str, Any]) -> tuple[dict[str, Any], str]:
         known = [ChainMap(_given(lens), shared) for lens in lenses]
     except ValidationError:
         return data, ""
-    problem = _solve(known, shared, [str(lens.get("name")) for lens in lenses])
+    names = [str(lens.get("name")) for lens in lenses]
+    problem = _solve(known, shared, names)
+    depths = [required_depth(quantities) for quantities in known]
+    if data["camera"].get("common") == "sensor" and not problem and all(depths):
+        front = max(range(len(lenses)), key=lambda index: depths[index] or 0)
+        pitches = {name: shared[name] for name in ("target_pitch", "sensor_pitch")}
+        whole = {"whole": shared["distance"] + (depths[front] or 0)}
+        behind = [ChainMap(_given(lens) | whole, pitches) for lens in lenses]
+        known = [known[index] if index == front else each for index, each in enumerate(behind)]
+        problem = _solve(known, shared, names)
     completed = copy.deepcopy(data)
     for name, (table, key) in SHARED.items():
         if name in shared:
@@ -217,7 +233,8 @@ def _solve(known: list[ChainMap[str, Fraction]], shared: dict[str, Fraction], na
             except ValueError as error:
                 return f"camera.lens.{name}: {error}"
             if found is not None:
-                (shared if found[0] in SHARED else quantities)[found[0]] = found[1]
+                own = found[0] not in SHARED or "whole" in quantities
+                (quantities if own else shared)[found[0]] = found[1]
                 grows = True
                 break
     return ""
@@ -227,6 +244,21 @@ def _focus(known: Known) -> Result:
     if "focus" not in known and "distance" in known:
         return "focus", known["distance"]
     return None
+
+
+def _one_sensor(known: Known) -> Result:
+    """The distance from the target of a lens whose sensor is `whole` from it, and which is sharp if nothing else."""
+    if "whole" not in known or "distance" in known:
+        return None
+    whole = known["whole"]
+    if "depth" in known:
+        return "distance", whole - known["depth"]
+    if "magnification" in known:
+        return "distance", whole / (1 + known["magnification"] * known["sensor_pitch"] / known["target_pitch"])
+    if "focal_length" not in known or "focus" in known:
+        return None
+    apart = max(whole * (whole - 4 * known["focal_length"]), Fraction(0))  # below 0 by rounding alone: whole is long
+    return "distance", (whole + _decimal(float(apart) ** 0.5)) / 2
 
 
 def _product(known: Known, above: tuple[str, ...], below: tuple[str, ...]) -> Result:
@@ -269,6 +301,7 @@ def _square(known: Known) -> Result:
 
 EQUATIONS: tuple[Callable[[Known], Result], ...] = (  # fields of view last: they give pixels to the nearest whole one
     _focus,
+    _one_sensor,
     partial(_product, above=("magnification", "distance", "sensor_pitch"), below=("depth", "target_pitch")),
     partial(_product, above=("f_number", "aperture"), below=("focal_length",)),
     _lens_equation,

@@ -104,8 +104,8 @@ def blur_of(camera: Camera, lens_type: LensType, wavelength: float | None = None
     if aperture is None:
         return Blur()
     wavelength = wavelength or camera.wavelength or 0.0
-    disk = aperture * abs(1 - camera.distance / camera.focus(lens_type)) / camera.target_pitch
-    airy = wavelength * camera.distance / np.pi / (aperture * camera.target_pitch)
+    disk = aperture * abs(1 - camera.distance_of(lens_type) / camera.focus(lens_type)) / camera.target_pitch
+    airy = wavelength * camera.distance_of(lens_type) / np.pi / (aperture * camera.target_pitch)
     blur = Blur(disk, airy, (aperture / (2 * camera.depth(lens_type))) ** 2)
     if airy and blur.waves > MOST_WAVES:
         blur = replace(blur, airy=0.0)
@@ -258,8 +258,8 @@ def _asymmetry(camera: Camera, lens_type: LensType, blur: Blur, offsets: IntArra
     """Change of an entry of H per pixel of f between a lens and the footprint of its pixel, along y: (n, n)."""
     inside = steepness(float(lens_type.footprint), offsets, unit, blur.slant_density)
     # A pixel at s sees the pupil's amplitude 2 s sqrt(weight) / depth brighter at the rim on its side.
-    lever = 2 * np.sqrt(blur.weight) * camera.target_pitch / camera.distance
-    return -np.sign(1 - camera.distance / camera.focus(lens_type)) * lever * inside
+    lever = 2 * np.sqrt(blur.weight) * camera.target_pitch / camera.distance_of(lens_type)
+    return -np.sign(1 - camera.distance_of(lens_type) / camera.focus(lens_type)) * lever * inside
 
 
 @dataclass(frozen=True)

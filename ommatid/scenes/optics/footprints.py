@@ -51,13 +51,13 @@ def sub_matrix(camera: Camera, sub: SubImager, pose: Pose) -> sparse.csr_array:
         raise ValueError(f"lens type {sub.type.name} has surfaces, expected a pinhole or a thin lens")
     k = coefficients(sub)
     project = _from_tangents(camera, sub, pose)
-    r = camera.distance / camera.half_diagonal
+    r = sub.distance / camera.half_diagonal
 
     def image(row: FloatArray, column: FloatArray) -> FloatArray:
         """(U, V) of points of the target in pixels of f: (2, rows, columns); NaN behind the plane of the patch."""
         x = (camera.columns / 2 - column) * camera.target_pitch - pose.lens[0]
         y = (camera.rows / 2 - row[:, None]) * camera.target_pitch - pose.lens[1]
-        tangents = distort(x / camera.distance, y / camera.distance, *k, r)
+        tangents = distort(x / sub.distance, y / sub.distance, *k, r)
         u, v, w = (a * tangents[0] + b * tangents[1] + c for a, b, c in project)
         return np.stack([u, v]) / np.where(w < LEAST_DEPTH, np.nan, w)
 

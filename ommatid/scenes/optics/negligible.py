@@ -207,8 +207,8 @@ def change_by_diffraction(camera: Camera, lens_type: LensType, aperture: float, 
     from .blur import MOST_WAVES, Blur, transfer
 
     footprint = float(lens_type.ratio) * camera.target_pitch
-    disk = aperture * abs(1 - camera.distance / focus) / footprint
-    airy = GREEN * camera.distance / np.pi / (aperture * footprint)
+    disk = aperture * abs(1 - camera.distance_of(lens_type) / focus) / footprint
+    airy = GREEN * camera.distance_of(lens_type) / np.pi / (aperture * footprint)
     waves, rays = Blur(disk, airy), Blur(disk)
     if waves.waves > MOST_WAVES:
         waves = rays

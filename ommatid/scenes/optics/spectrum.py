@@ -171,7 +171,9 @@ def _defocus(scene: Scene, lens: LensTable, wavelength: FloatArray, middle: floa
     if power <= 0:
         return np.zeros(wavelength.size)
     pitches = scene.target.pixel_pitch / (scene.camera.pixel_pitch * float(lens.magnification))
-    scale = lens.scale if isinstance(lens.scale, float) else power * scene.target.distance / (1 + pitches)
+    distance, whole = scene.target.distance, scene.sensor_distance
+    distance = distance if whole is None else whole * pitches / (1 + pitches)
+    scale = lens.scale if isinstance(lens.scale, float) else power * distance / (1 + pitches)
     return radii[0] ** 2 * scale * (np.interp(wavelength, at, powers) - power) / (2 * wavelength / MILLIMETRE)
 
 

@@ -240,6 +240,12 @@ class CameraTable(Table):
     walls: bool = Field(
         default=True, description="light of a lens reaches its own patch of the sensor only; false: those of all lenses"
     )
+    common: Literal["lenses", "sensor"] = Field(
+        default="lenses",
+        exclude_if=lambda value: value == "lenses",
+        description='what all types share: "lenses": their plane, with sensors of several depths; "sensor": one chip,'
+        " before which each type stands at the height that keeps its magnification",
+    )
     glass_catalogue: FileName | None = Field(
         default=None,
         exclude_if=lambda value: value is None,
@@ -277,6 +283,10 @@ class CameraTable(Table):
                     f"walls = false needs thin lenses with an aperture and without distortion, which weigh their light,"
                     f" got lens type '{lens.name}'; add an aperture or keep the walls"
                 )
+        if not self.walls and self.common == "sensor":
+            raise ValueError(
+                'walls = false needs all lenses in one plane, got common = "sensor"; remove one of the two keys'
+            )
         return self
 
     @model_validator(mode="after")

@@ -336,7 +336,9 @@ def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> L
     if lens_type.optics.aperture is None:
         raise ValueError(f"lens type '{lens_type.name}' is a pinhole, expected a lens")
     depth, (far, _, _) = camera.depth(lens_type), reach(camera, lens_type)
-    return ThinField(depth, camera.distance, far, wavelength, lens_type.optics.aperture, camera.focus(lens_type))
+    return ThinField(
+        depth, camera.distance_of(lens_type), far, wavelength, lens_type.optics.aperture, camera.focus(lens_type)
+    )
 
 
 @lru_cache(maxsize=16)
@@ -346,7 +348,7 @@ def surface_field(camera: Camera, lens_type: LensType, wavelength: float | None)
     The lens is scaled and placed as at the camera's wavelength; another one changes the glass alone, so that principal
     planes move and the distances from them with them. Raises InputError if the surfaces form no image.
     """
-    (far, _, _), depth, distance = reach(camera, lens_type), camera.depth(lens_type), camera.distance
+    (far, _, _), depth, distance = reach(camera, lens_type), camera.depth(lens_type), camera.distance_of(lens_type)
     lens = prescription_of(camera, lens_type)
     if wavelength is not None and wavelength != camera.wavelength and lens_type.optics.surfaces is not None:
         other = replace(lens, index=prescribe(lens_type.optics.surfaces, wavelength).index)

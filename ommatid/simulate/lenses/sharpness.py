@@ -97,21 +97,21 @@ def _described(camera: Camera, lens_type: LensType) -> dict[str, Any]:
 
 def _at_height(camera: Camera, lens_type: LensType, height: float) -> dict[str, float | None]:
     """Return spot, wavefront error, Strehl ratio and contrast at a height of the sensor point."""
-    wavelength, depth = camera.wavelength, camera.depth(lens_type)
+    wavelength = camera.wavelength
     field = field_of(camera, lens_type, wavelength)
     rays = field.wave(height, None)
     wave = None if wavelength is None or rays is None or field.rays_suffice else field.wave(height, wavelength)
     return {
-        "spot": None if rays is None else _spot(rays) * depth / camera.distance,
+        "spot": None if rays is None else _spot(rays) * camera.optical_magnification(lens_type),
         "wavefront": None if wave is None else _wavefront_error(wave),
         "strehl": None if wave is None else strehl_ratio(wave),
-        "contrast": None if wave is None else _contrast(camera, depth, wave),
+        "contrast": None if wave is None else _contrast(camera, field, wave),
     }
 
 
-def _contrast(camera: Camera, depth: float, wave: Wavefront, grid: tuple[float, float] | None = None) -> float:
+def _contrast(camera: Camera, field: LensField, wave: Wavefront, grid: tuple[float, float] | None = None) -> float:
     """Return the modulation transfer at half the sensor's Nyquist frequency, of the worse direction."""
-    frequency = depth / camera.distance / (4 * camera.pixel_pitch)  # on the target
+    frequency = field.depth / field.distance / (4 * camera.pixel_pitch)  # on the target
     return float(point_spread(wave, grid).transfer(np.array([[frequency, 0.0], [0.0, frequency]])).min())
 
 
@@ -142,7 +142,7 @@ def _contrasts(camera: Camera, field: LensField, height: float, vergences: Float
     bend = np.square(field.distance * across).sum(axis=0) / 2
     grid = grid_of(wave)[0], half
     moved = (replace(wave, path=wave.path - vergence * bend) for vergence in vergences)
-    return np.array([_contrast(camera, field.depth, each, grid) for each in moved])
+    return np.array([_contrast(camera, field, each, grid) for each in moved])
 
 
 def _spot(rays: Wavefront) -> float:
@@ -179,7 +179,7 @@ def _distortion(camera: Camera, lens_type: LensType, rays: LensField) -> float:
     if given is not None:
         pairs = zip(camera.sub_imagers, poses(camera), strict=True)
         limit = max(distortion.field(camera, sub, pose) for sub, pose in pairs if sub.type == lens_type)
-        tangent, scale = height / rays.depth, camera.distance / camera.half_diagonal
+        tangent, scale = height / rays.depth, camera.distance_of(lens_type) / camera.half_diagonal
         return tangent / float(distortion.undistort(tangent, 0.0, *given, scale, limit)[0]) - 1
     if lens_type.optics.surfaces is None:
         return 0.0

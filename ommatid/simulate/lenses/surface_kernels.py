@@ -59,7 +59,7 @@ class _FieldRows:
     def _pitch(self) -> float:
         """Distance on the sensor per pixel of f."""
         camera = self.places.camera
-        return camera.target_pitch * camera.depth(self.places.lens_type) / camera.distance
+        return camera.target_pitch * camera.optical_magnification(self.places.lens_type)
 
     def _row(self, field: LensField, x: float, y: float, beside: FloatArray) -> FloatArray:
         camera, wide = self.places.camera, self.places.width
@@ -136,7 +136,7 @@ def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[LensField, 
     """Return by how many pixels of f light reaches beyond a footprint, distortion included."""
     places = KernelPlaces(camera, lens_type, 0)
     corner = np.array(places.extent) * places.scale
-    shrink = camera.target_pitch * camera.depth(lens_type) / camera.distance
+    shrink = camera.target_pitch * camera.optical_magnification(lens_type)
     reach = 0.0
     for field, _ in fields:
         spot = max(wave.spot_radius for wave in field.nodes[1])

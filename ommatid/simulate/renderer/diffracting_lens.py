@@ -54,7 +54,7 @@ class DiffractingLens(LensModel):
         self._limits = mi.Float(np.cumsum([share for _, share in self._bands])[:-1].astype(np.float32))
         self.tail = max(blur.reach for blur, _ in blurs_of(camera, lens_type))
         _, least, largest = reach(camera, lens_type)
-        self._tabulate([1 / camera.distance + 1 / depth - 1 / self._depth for depth in (least, largest)])
+        self._tabulate([1 / camera.distance_of(lens_type) + 1 / depth - 1 / self._depth for depth in (least, largest)])
 
     def follow(self, distance: Distance) -> None:
         """Let rays have the pattern of the distance of the surface that they meet."""
@@ -91,7 +91,7 @@ class DiffractingLens(LensModel):
         beam = Beam(share, cosine, sine, 2 * (x * cosine + y * sine) * (self._aperture / 2) / (depth * depth))
         shift = 1 / depth - 1 / self._depth
         if self.distance is None:
-            slopes, slant = self._displaced(chief, 1 / self._camera.distance + shift, beam, band)
+            slopes, slant = self._displaced(chief, 1 / self._camera.distance_of(self._type) + shift, beam, band)
             return (0, 0, 0), (*slopes, 1), light * slant
         rim = dr.sqrt(beam.share / (1 + self._weight * (1 - beam.share))) * self._aperture / 2
         start = rim * cosine, rim * sine

@@ -58,7 +58,7 @@ class LensModel:
     def __init__(self, camera: Camera, lens_type: LensType) -> None:
         """Create the model of a lens type."""
         self._distortion = lens_type.optics.distortion
-        self._corner = camera.distance / camera.half_diagonal
+        self._corner = camera.distance_of(lens_type) / camera.half_diagonal
         if self._distortion is not None:
             from ommatid.scenes.optics.distortion import field
 

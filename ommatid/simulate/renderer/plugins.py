@@ -60,14 +60,14 @@ def stock_sensor(
     width = float(sub.type.ratio) * columns * camera.target_pitch
     height = float(sub.type.ratio) * rows * camera.target_pitch
     x, y = camera.position(*sub.type.middle(sub.window))
-    lens_x, lens_y = sub.lens
-    pose = mi.ScalarTransform4f().look_at([lens_x, lens_y, 0], [lens_x, lens_y, 1], [0, 1, 0])
+    (lens_x, lens_y), z = sub.lens, camera.distance - sub.distance
+    pose = mi.ScalarTransform4f().look_at([lens_x, lens_y, z], [lens_x, lens_y, z + 1], [0, 1, 0])
     return {
         "type": "perspective",
         "fov_axis": "x",
-        "fov": 2 * degrees(atan(width / 2 / camera.distance)),
-        "near_clip": camera.distance * 1e-3 / placement.unit,
-        "far_clip": camera.distance * far / placement.unit,
+        "fov": 2 * degrees(atan(width / 2 / sub.distance)),
+        "near_clip": sub.distance * 1e-3 / placement.unit,
+        "far_clip": sub.distance * far / placement.unit,
         "principal_point_offset_x": -(x - lens_x) / width,
         "principal_point_offset_y": -(y - lens_y) / height,
         "to_world": placement.to_world(pose, rigid=True),

@@ -66,7 +66,8 @@ class RayGenerator:
         self._placement = MILLIMETRES_AT_ORIGIN
         self._loaded: tuple[slice, list[Any], Any] | None = None  # of the last block of all pixels
         self._pitch = float(camera.pixel_pitch)
-        self._open = float(types[0].open)  # of all of these types
+        self._open = float(types[0].open)  # of all of these types,
+        self._height = camera.height(types[0])  # and so is this
         self._crossing = None
         if not camera.walls:
             from .crosstalk import Crosstalk
@@ -77,8 +78,12 @@ class RayGenerator:
 
     def follow(self, distance: Distance, placement: Placement) -> None:
         """Tell all lenses how far the surfaces of a world are, and where the camera stands in it."""
-        self._placement = placement
-        (self._crossing or self.lens).follow(distance)
+        self._placement, height = placement, self._height
+
+        def from_lens(origin: Any, direction: Any) -> Any:
+            return distance((*origin[:2], origin[2] - height), direction)
+
+        (self._crossing or self.lens).follow(from_lens)
         self.lens.captured = 1.0 if self._crossing is not None else self.lens.captured
 
     def blocks(self, samples: int, pixels: int | None = None) -> list[slice]:
@@ -195,7 +200,7 @@ class RayGenerator:
             own = dr.gather(mi.UInt32, places[1], index)
             start, direction, weight = self._crossing.emit(own, (x, y, -z), draws, (lens_x, lens_y))
         ray = dr.zeros(mi.RayDifferential3f, lanes)
-        origin = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2])
+        origin = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2] - self._height)
         ray.o, ray.d = self._placement.carry(origin, dr.normalize(mi.Vector3f(*direction)))
         ray.maxt = dr.largest(mi.Float)
         return ray, weight

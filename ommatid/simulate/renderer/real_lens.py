@@ -66,7 +66,7 @@ class WaveLens(RealLens):
     def __init__(self, camera: Camera, lens_type: LensType, fields: list[tuple[SurfaceField, float]]) -> None:
         """Create the model of a lens type with its fields at the wavelengths of the light, and their shares."""
         super().__init__(camera, lens_type)
-        self._fields, self._depth, self._vergence = fields, camera.depth(lens_type), 1 / camera.distance
+        self._fields, self._depth, self._vergence = fields, camera.depth(lens_type), 1 / camera.distance_of(lens_type)
         self._focus = 1 / camera.focus(lens_type)
         self._distance: Distance | None = None
         _, least, largest = reach(camera, lens_type)

@@ -337,7 +337,7 @@ class Renderer:
 
 def _groups(camera: Camera, together: bool) -> dict[str, tuple[LensType, ...]]:
     """Return the lens types that are rendered together, by a name."""
-    alike = all(each.optics.is_pinhole and each.open == camera.types[0].open for each in camera.types)
-    if together and alike:
+    alike = {(each.open, camera.height(each)) for each in camera.types}
+    if together and len(alike) == 1 and all(each.optics.is_pinhole for each in camera.types):
         return {"camera": camera.types}
     return {lens_type.name: (lens_type,) for lens_type in camera.types}

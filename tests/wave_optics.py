@@ -1,4 +1,4 @@
-"""Wave optics of a lens of spheres that shares no code with the program's: direct sums over the aperture stop.
+"""Wave optics of a lens of conics and aspheres without code of the program: direct sums over the aperture stop.
 
 The stop is the first surface. Rays of a sensor point are aimed, by Newton's method, at the nodes of a quadrature over
 the stop; from there the field goes to points of the target by a Rayleigh-Sommerfeld sum with true distances.
@@ -35,22 +35,28 @@ def _traced(lens: Prescription, height: float, sensor: float, slopes: np.ndarray
     vertices = np.append(0.0, np.cumsum(lens.thickness[:-1]))
     indices = np.append(1.0, lens.index)
     for number in reversed(range(lens.radius.size)):
-        vertex, radius = vertices[number], lens.radius[number]
-        if np.isinf(radius):
-            run = (vertex - point[2]) / direction[2]
-            point = point + run * direction
-            normal = np.array([[0.0], [0.0], [-1.0]]) + 0 * direction
-        else:
-            centre = np.array([[0.0], [0.0], [vertex + radius]])
-            half = (direction * (point - centre)).sum(axis=0)
-            root = np.sqrt(half**2 - ((point - centre) ** 2).sum(axis=0) + radius**2)
-            run = -half + np.sign(radius) * root  # the side of the sphere at its vertex
-            point = point + run * direction
-            normal = (point - centre) / radius
+        run = (vertices[number] - point[2]) / direction[2]
+        for _ in range(12):  # Newton's method, from the plane of the vertex
+            x, y, z = point + run * direction
+            sag, slope = _sag(lens, number, x * x + y * y)
+            normal = np.stack([2 * slope * x, 2 * slope * y, -np.ones_like(x)])
+            run = run - (sag - (z - vertices[number])) / (normal * direction).sum(axis=0)
+        point = point + run * direction
+        _, slope = _sag(lens, number, point[0] ** 2 + point[1] ** 2)
+        normal = np.stack([2 * slope * point[0], 2 * slope * point[1], -np.ones_like(slope)])
+        normal = normal * np.sign((normal * direction).sum(axis=0)) / np.sqrt((normal**2).sum(axis=0))
         path = path + indices[number + 1] * run
         ratio, cosine = indices[number + 1] / indices[number], (normal * direction).sum(axis=0)
         direction = ratio * direction + (np.sqrt(1 - ratio**2 * (1 - cosine**2)) - ratio * cosine) * normal
     return point, direction, path
+
+
+def _sag(lens: Prescription, number: int, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sag of a surface at squared heights, and its derivative by these."""
+    bend, conic = 1 / lens.radius[number], lens.conic[number]
+    root = np.sqrt(1 - (1 + conic) * bend**2 * square)
+    terms = np.polynomial.Polynomial([0.0, 0.0, *(lens.aspheric[number] if lens.aspheric else ())])
+    return bend * square / (1 + root) + terms(square), bend / (2 * root) + terms.deriv()(square)
 
 
 def aperture_of(lens: Prescription, depth: float, height: float, rings: int = 40, turns: int = 80) -> Aperture:
@@ -70,7 +76,7 @@ def aperture_of(lens: Prescription, depth: float, height: float, rings: int = 40
         slopes = slopes + np.stack([x * up[1] - y * up[0], y * right[0] - x * right[1]]) / grown
     point, direction, path = _traced(lens, height, sensor, slopes)
     assert np.abs(point[:2] - wanted).max() < 1e-9
-    tilt = 0 * wanted if np.isinf(lens.radius[0]) else point[:2] / (lens.radius[0] - point[2])
+    tilt = 2 * _sag(lens, 0, point[0] ** 2 + point[1] ** 2)[1] * point[:2]
     through = np.abs(direction[2] - (tilt * direction[:2]).sum(axis=0))  # light's cosine times surface per area
     light = 1 / (1 + (slopes**2).sum(axis=0)) ** 2 / np.abs(grown) * area
     return Aperture(point, path, np.sqrt(light * through * area), np.hypot(*wanted) / rim)
@@ -79,18 +85,20 @@ def aperture_of(lens: Prescription, depth: float, height: float, rings: int = 40
 _STEPS = STEP * np.array([[[1.0], [0.0]], [[0.0], [1.0]]])
 
 
-def _distances(lens: Prescription, distance: float, aperture: Aperture, height: float) -> np.ndarray:
-    target = np.array([[0.0], [height], [lens.front_principal - distance]])
+def _distances(
+    lens: Prescription, distance: float, aperture: Aperture, height: float, aside: float = 0.0
+) -> np.ndarray:
+    target = np.array([[aside], [height], [lens.front_principal - distance]])
     return np.sqrt(((aperture.points - target) ** 2).sum(axis=0))
 
 
 def relative_light(
-    lens: Prescription, distance: float, aperture: Aperture, heights: np.ndarray, wavelength: float
+    lens: Prescription, distance: float, aperture: Aperture, heights: np.ndarray, wavelength: float, aside: float = 0.0
 ) -> np.ndarray:
-    """Return |field|^2 at points (0, height) of the target, 1 if all waves arrived there in phase."""
+    """Return |field|^2 at points (aside, height) of the target, 1 if all waves arrived there in phase."""
     found: list[float] = []
     for height in heights:
-        away = _distances(lens, distance, aperture, height)
+        away = _distances(lens, distance, aperture, height, aside)
         path = aperture.paths + away
         wave = aperture.strengths / away * np.exp(2j * np.pi / wavelength * (path - path[0]))
         found.append(abs(wave.sum()) ** 2 / (aperture.strengths / away).sum() ** 2)

@@ -212,6 +212,9 @@ def light_rows(light: dict[str, Any]) -> list[tuple[str, str]]:
     lines = [("light", _spectrum_words(light))] + [
         (f"lens type {row['name']}", _electrons_words(row)) for row in light["lens_types"]
     ]
+    for row in light["lens_types"]:
+        if "accepted" in row:
+            lines.append((f"acceptance of {row['name']}", f"{row['accepted']:.1%} at its steepest chief ray"))
     for name, share in light.get("transmitted", {}).items():
         lines.append((f"surfaces of {name}", f"transmit {share:.1%} of the light"))
     if light["dark"] > 0:

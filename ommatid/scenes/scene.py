@@ -108,6 +108,8 @@ class Scene(Table):
                 "camera.walls = false leaves H without a closed form: expected calibration.method 'transport', no fit,"
                 f" got '{self.calibration.method}'"
             )
+        if not self.camera.walls and self.sensor is not None and self.sensor.acceptance is not None:
+            raise ValueError("sensor.acceptance needs walls, since light through other lenses comes at other angles")
         if self.light is not None and self.camera.wavelength is not None:
             raise ValueError("expected camera.wavelength or light.spectrum, got both; remove one")
         if self.target.image is None and self.target.shape is None:

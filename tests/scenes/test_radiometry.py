@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import pi
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.optics import radiometry
 from ommatid.scenes.optics.radiometry import electrons, predicted_noise, solid_angle, summary
 from ommatid.scenes.pose import NO_MISALIGNMENT, Misalignment, pose_of
-from ommatid.scenes.scene import Scene
+from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.scenes.tables.sensor import SensorTable
 
@@ -56,6 +57,48 @@ def test_the_solid_angle_is_the_integral_over_the_cone(aperture: float) -> None:
     whole, _ = integrate.quad(lambda angle: 2 * pi * np.cos(angle) * np.sin(angle), 0, edge)
     assert solid_angle(aperture, 2.0) == pytest.approx(whole, rel=1e-9)
     assert solid_angle(aperture, 2.0) <= pi
+
+
+def test_electrons_follow_the_acceptance_at_the_angle_of_the_chief_ray() -> None:
+    """The angle's tangent is the distance of a pixel from the lens's axis over the depth; the curve is linear."""
+    described = real()
+    assert described.sensor is not None
+    camera, limit = derive(described), 0.02
+    curve = ((limit, 0.4),)
+    accepting = described.model_copy(update={"sensor": described.sensor.model_copy(update={"acceptance": curve})})
+    ratio = electrons(accepting, camera) / electrons(described, camera)
+    for sub, pixels in zip(camera.sub_imagers, camera.slices(), strict=True):
+        rows_, columns = sub.type.pixels
+        x = sub.patch[0] - sub.lens[0] + (np.arange(columns) - (columns - 1) / 2) * camera.pixel_pitch
+        y = sub.patch[1] - sub.lens[1] + (np.arange(rows_) - (rows_ - 1) / 2) * camera.pixel_pitch
+        angle = np.arctan(np.hypot(x[None, :], y[:, None]) / sub.depth)
+        np.testing.assert_allclose(ratio[pixels], 1 - 0.6 * angle.ravel() / limit, rtol=1e-12)
+    told = summary(accepting, camera, electrons(accepting, camera))["lens_types"]
+    assert [row["accepted"] for row in told] == [
+        pytest.approx(ratio[pixels].min(), rel=1e-12) for pixels in camera.type_slices()
+    ]
+    short = described.sensor.model_copy(update={"acceptance": ((1e-3, 0.4),)})
+    with pytest.raises(InputError, match="ends at"):
+        electrons(described.model_copy(update={"sensor": short}), camera)
+
+
+@pytest.mark.parametrize(
+    "rows", [[["2 deg", 1], ["1 deg", 0.5]], [["90 deg", 0.5]], [["5 deg", 0]], [[5, 1]], [["5 deg"]], [], [7], 5]
+)
+def test_curves_that_are_no_acceptance_are_refused(rows: object) -> None:
+    data = real().plain()
+    data["sensor"]["acceptance"] = rows
+    with pytest.raises(InputError, match="acceptance"):
+        parse(data, Path("test.toml"))
+
+
+def test_an_acceptance_needs_walls() -> None:
+    data = real(calibration={"method": "transport"}).plain()
+    data["camera"]["walls"] = False
+    parse(data, Path("test.toml"))
+    data["sensor"]["acceptance"] = [["5 deg", 0.9]]
+    with pytest.raises(InputError, match="walls"):
+        parse(data, Path("test.toml"))
 
 
 def test_illumination_falls_with_the_fourth_power_of_the_cosine() -> None:

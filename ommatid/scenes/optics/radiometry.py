@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import pi
+from math import degrees, pi
 from typing import Any
 
 import numpy as np
@@ -47,14 +47,40 @@ def relative_illumination(camera: Camera, sub: SubImager, pose: Pose) -> FloatAr
     Light of a lens of area A at the distance r is cos(at the lens) cos(at the sensor) A / r^2; the two angles differ
     where the patch is tilted, and otherwise this is the cos^4 law of the chief ray.
     """
+    points, along_normal = _pixel_places(camera, sub, pose)
+    squared = np.square(points).sum(axis=-1)
+    return (np.abs(points[..., 2] * along_normal) * sub.depth**2 / squared**2).ravel()
+
+
+def chief_ray_angles(camera: Camera, sub: SubImager, pose: Pose) -> FloatArray:
+    """Angles, rad, at which a sub-imager's pixels receive the rays through the middle of its lens: (its pixels,)."""
+    points, along_normal = _pixel_places(camera, sub, pose)
+    aside = np.linalg.norm(np.cross(points, np.cross(pose.axes[:, 0], pose.axes[:, 1])), axis=-1)
+    return np.arctan2(aside, np.abs(along_normal)).ravel()
+
+
+def _pixel_places(camera: Camera, sub: SubImager, pose: Pose) -> tuple[FloatArray, FloatArray]:
+    """Return the middles of pixels from their lens, (rows, columns, 3), and these along the normal of the patch."""
     rows, columns = sub.type.pixels
     left, top = corner_offset(camera, sub)
     u = (left + (np.arange(columns) + 0.5) * camera.pixel_pitch)[None, :, None]
     v = (top + (np.arange(rows) + 0.5) * camera.pixel_pitch)[:, None, None]
     points = pose.middle + u * pose.axes[:, 0] + v * pose.axes[:, 1]
-    along_normal = points @ np.cross(pose.axes[:, 0], pose.axes[:, 1])
-    squared = np.square(points).sum(axis=-1)
-    return (np.abs(points[..., 2] * along_normal) * sub.depth**2 / squared**2).ravel()
+    return points, points @ np.cross(pose.axes[:, 0], pose.axes[:, 1])
+
+
+def _acceptance(scene: Scene, camera: Camera, sub: SubImager, pose: Pose) -> FloatArray | float:
+    """Return the response of a sub-imager's pixels to light at the angle of its chief ray, (its pixels,), 1 at 0."""
+    rows = None if scene.sensor is None else scene.sensor.acceptance
+    if rows is None:
+        return 1.0
+    angles, (known, shares) = chief_ray_angles(camera, sub, pose), np.transpose([(0.0, 1.0), *rows])
+    if angles.max() > known[-1]:
+        raise InputError(
+            f"{scene.source}: sensor.acceptance ends at {degrees(known[-1]):.4g} deg, and chief rays of lens type"
+            f" '{sub.type.name}' reach {degrees(angles.max()):.4g} deg; add a row, or make the sub-images smaller"
+        )
+    return np.asarray(np.interp(angles, known, shares), dtype=np.float64)
 
 
 def electrons(
@@ -68,7 +94,8 @@ def electrons(
     solid_angles : sr by the name of the lens type, projected and on the axis, times the share of light transmitted, for
         lens types with surfaces; thin lenses lose nothing
     illumination : (M,) relative to the axis, for pixels behind surfaces, absent: 1; thin lenses follow cos^4
-    Raises ValueError without a sensor, or if a solid angle of a lens with surfaces is missing.
+    Raises ValueError without a sensor, or if a solid angle of a lens with surfaces is missing, InputError for chief
+    rays at larger angles than those of `sensor.acceptance`.
     """
     if scene.sensor is None:
         raise ValueError("numbers of electrons need a scene with a [sensor], got one without")
@@ -85,6 +112,7 @@ def electrons(
             response[pixels] = unit * angle * relative_illumination(camera, sub, pose)
         else:
             response[pixels] = unit * angle * (1.0 if illumination is None else illumination[pixels])
+        response[pixels] *= _acceptance(scene, camera, sub, pose)
     return response
 
 
@@ -141,16 +169,19 @@ def summary(scene: Scene, camera: Camera, response: FloatArray) -> dict[str, Any
     saturation : value that saturates the brightest pixel;  saturates : True if that is below 255
     noise : standard deviation of a value for a target at the prior's mean, in units of f, rms over the pixels
     efficacy : of the light, lm/W;  wavelengths : in mm, which stand for a spectrum, and the share of each
+    accepted : least response of a pixel to the angle of its chief ray, relative to 0, of a sensor with an acceptance
     cut_off : True if noise of the dark reaches below a digital number of 0 (EMVA 1288 asks for a higher black level)
     """
     if scene.sensor is None:
         raise ValueError("numbers of electrons need a scene with a [sensor], got one without")
     sensor, noise = scene.sensor, expected_noise(scene, camera, response)
     lens_types: list[dict[str, Any]] = []
+    places = [*zip(camera.sub_imagers, poses(camera), strict=True)] if sensor.acceptance else []
     for lens_type, pixels in zip(camera.types, camera.type_slices(), strict=True):
         of_open = float(lens_type.light) * response[pixels]
         average, brightest = float(of_open.mean()), float(of_open.max())
         saturation = saturation_electrons(sensor) / brightest if brightest > 0 else None
+        accepted = [float(np.min(_acceptance(scene, camera, *place))) for place in places if place[0].type == lens_type]
         alive = noise[pixels][np.isfinite(noise[pixels])]
         lens_types.append(
             {
@@ -160,6 +191,7 @@ def summary(scene: Scene, camera: Camera, response: FloatArray) -> dict[str, Any
                 "saturation": saturation,
                 "saturates": saturation is not None and saturation < WHITE,
                 "noise": float(np.sqrt(alive.mean())) if alive.size else None,
+                **({"accepted": min(accepted)} if accepted else {}),
             }
         )
     return {

@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
+from math import degrees, pi
 from typing import Annotated, cast
 
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
@@ -14,13 +16,14 @@ from ommatid.runtime.errors import shortened_repr
 
 from ..formats import curve
 from .table import LARGEST, Table
-from .units import LENGTH, Illuminance, Time, file_name
+from .units import LENGTH, Angle, Illuminance, Time, file_name
 
 FULL_SCALE = 256.0
 MILLIMETRE = 1e6  # nm
 ILLUMINANTS = ("D65", "LED-B3")
 INTERVAL = re.compile(r"\s*([0-9.]+)(?:\s*-\s*([0-9.]+))?\s*([^\W\d]+)\s*")
 FILE = re.compile(r".+\.[A-Za-z]+\s*")
+MOST_ANGLES = 100
 _POINTS = {"type": "array", "items": {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}}
 _CURVE = [{"type": "string"}, {**_POINTS, "minItems": 2}]
 
@@ -68,6 +71,23 @@ def _efficiency(value: object) -> object:
     if not isinstance(value, list | tuple):
         raise ValueError(f"expected a number, the name of a file or a curve, got {shortened_repr(value)}")
     return curve.checked(cast(object, value), 1.0)
+
+
+def _rows(value: object) -> object:
+    """Return the rows of a list as tuples."""
+    if not isinstance(value, list | tuple):
+        raise ValueError(
+            f'expected rows of an angle above 0 and a share, [["15 deg", 0.9], ...], got {shortened_repr(value)}'
+        )
+    rows = cast(list[object], value)
+    return tuple(tuple(cast(list[object], row)) if isinstance(row, list) else row for row in rows)
+
+
+Acceptance = Annotated[
+    tuple[tuple[Angle, Annotated[float, Field(gt=0, le=2)]], ...],
+    Field(min_length=1, max_length=MOST_ANGLES),
+    BeforeValidator(_rows),
+]
 
 
 class LightTable(Table):
@@ -141,6 +161,11 @@ class SensorTable(Table):
     prnu: float = Field(
         default=0.0, ge=0, lt=0.5, description="relative standard deviation between the responses of pixels (PRNU1288)"
     )
+    acceptance: Acceptance | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="response against the angle of the chief ray, rows of angle and share, 1 at 0; absent: 1",
+    )
     gain: float = Field(default=1.0, gt=0, le=1e6, description="DN per electron, the system gain K")
     black_level: float = Field(default=0.0, ge=0, le=1e6, description="DN without light")
     bits: int = Field(default=12, ge=1, le=24, description="of a digital number")
@@ -155,6 +180,16 @@ class SensorTable(Table):
     def _check_range(self) -> SensorTable:
         if self.black_level >= self.full:
             raise ValueError(f"expected a black_level below saturation at {self.full:g} DN, got {self.black_level:g}")
+        return self
+
+    @model_validator(mode="after")
+    def _check_acceptance(self) -> SensorTable:
+        for (angle, _), (following, _) in pairwise(((0.0, 1.0), *(self.acceptance or ()))):
+            if not angle < following < pi / 2:
+                raise ValueError(
+                    f"acceptance: expected angles that rise to less than 90 deg, got {degrees(following):.6g} deg after"
+                    f" {degrees(angle):.6g} deg"
+                )
         return self
 
     @property

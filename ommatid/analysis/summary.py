@@ -86,7 +86,7 @@ def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "array": list(lens_type.array),
         "pixels": list(lens_type.pixels),
         "step": lens_type.described_step,
-        **({} if lens_type.open == 1 else {"fill_factor": str(lens_type.open)}),
+        **({} if lens_type.is_open else {"fill_factor": lens_type.opening}),
         **({"steered": len(lens_type.steered)} if lens_type.steered else {}),
         "sees_rows": [float(end) for end in lens_type.bounds[0]],
         "sees_columns": [float(end) for end in lens_type.bounds[1]],

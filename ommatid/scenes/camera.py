@@ -155,7 +155,7 @@ class Camera:
     @property
     def has_stock_sensors(self) -> bool:
         """True if Mitsuba's own sensors render it: ideal pinholes before pixels that are all open."""
-        return self.is_ideal_pinhole and all(lens_type.open == 1 for lens_type in self.types)
+        return self.is_ideal_pinhole and all(lens_type.is_open for lens_type in self.types)
 
     @property
     def has_box_footprints(self) -> bool:
@@ -315,7 +315,7 @@ class Camera:
                 "array": list(lens_type.array),
                 "pixels": list(lens_type.pixels),
                 "step": lens_type.described_step,
-                **({} if lens_type.open == 1 else {"open": str(lens_type.open), "light": str(lens_type.light)}),
+                **({} if lens_type.is_open else {"open": lens_type.opening, "light": str(lens_type.light)}),
                 **lens_type.optics.describe(),
                 **({"sub_imagers": [each.describe() for each in lens_type.steered]} if lens_type.steered else {}),
             }
@@ -384,6 +384,6 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # reading the scene replaced file names
     optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale, lens.coating)
     part = scene.camera.fill_factor if lens.fill_factor is None else lens.fill_factor
-    light = Fraction(1) if scene.camera.fill_light == "kept" else part**2
+    light = Fraction(1) if scene.camera.fill_light == "kept" else part[0] * part[1]
     lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics, open=part, light=light)
     return with_steering(lens_type.centred(rows, columns), lens.sub_imager or (), (rows, columns), scene.source)

@@ -96,7 +96,8 @@ class LensType:
     left : columns of sub-imagers of other types to its left; None: those of the types listed before it
     steered : sub-imagers off the grid;  rotation : of all sensor patches
     above : rows of lenses above it, and rows of all, of a part of an array; None of a whole array
-    open : side of the square open part of a sensor pixel over its pitch;  light : of a uniform target that it receives
+    open : height and width of the open part of a sensor pixel over its pitch
+    light : of a uniform target that it receives
     """
 
     name: str
@@ -110,18 +111,30 @@ class LensType:
     steered: tuple[Steering, ...] = ()
     rotation: float = 0.0
     above: tuple[int, int] | None = None
-    open: Fraction = Fraction(1)
+    open: tuple[Fraction, Fraction] = (Fraction(1), Fraction(1))
     light: Fraction = Fraction(1)
 
     @property
-    def footprint(self) -> Fraction:
-        """Pixels of f that the open part of a sensor pixel covers along one axis."""
-        return self.open * self.ratio
+    def is_open(self) -> bool:
+        """True if sensor pixels are open as a whole."""
+        return self.open == (1, 1)
 
     @property
-    def inset(self) -> Fraction:
-        """Pixels of f from the edge of a sensor pixel to that of its open part."""
-        return (self.ratio - self.footprint) / 2
+    def opening(self) -> str:
+        """The side of the open parts of sensor pixels over the pitch, or height x width."""
+        down, across = map(str, self.open)
+        return down if down == across else f"{down} x {across}"
+
+    @property
+    def footprint(self) -> tuple[Fraction, Fraction]:
+        """Pixels of f that the open part of a sensor pixel covers, down and across."""
+        return self.open[0] * self.ratio, self.open[1] * self.ratio
+
+    @property
+    def inset(self) -> tuple[Fraction, Fraction]:
+        """Pixels of f from the edge of a sensor pixel to that of its open part, down and across."""
+        down, across = self.footprint
+        return (self.ratio - down) / 2, (self.ratio - across) / 2
 
     @property
     def count(self) -> int:
@@ -203,7 +216,7 @@ class LensType:
     @property
     def covers_whole_pixels(self) -> bool:
         """True if footprints of pinholes are whole pixels of f."""
-        return self.is_aligned and self.footprint.denominator == self.inset.denominator == 1
+        return self.is_aligned and all(number.denominator == 1 for number in (*self.footprint, *self.inset))
 
     @property
     def bounds(self) -> tuple[tuple[Fraction, Fraction], tuple[Fraction, Fraction]]:

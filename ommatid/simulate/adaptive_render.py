@@ -357,8 +357,8 @@ class AdaptiveRounds:
         """Return a plan that fits the edges of pixels of f or Sobol's points, where the sampler can make use of it."""
         if self._sobol[index]:
             return power_of_two_plan(samples, most)
-        side = self._camera.sub_imagers[index].type.footprint
-        return on_grid(samples, self._scene.render.sampler, cells_of(side), most)
+        cells = cells_of(self._camera.sub_imagers[index].type)
+        return on_grid(samples, self._scene.render.sampler, cells, most)
 
     def state(self) -> State:
         """Return the arrays of a checkpoint."""

@@ -30,8 +30,8 @@ from ommatid.scenes.scene import Scene
 def sub_matrix(camera: Camera, sub: SubImager) -> sparse.csr_array:
     """Return H of one sub-imager behind a pinhole: (its pixels, N)."""
     down, across = (
-        overlap(sub.type.ratio, pixels, start, size, sub.type.open)
-        for pixels, start, size in zip(sub.type.pixels, sub.window, camera.shape, strict=True)
+        overlap(sub.type.ratio, pixels, start, size, part)
+        for pixels, start, size, part in zip(sub.type.pixels, sub.window, camera.shape, sub.type.open, strict=True)
     )
     return float(sub.type.light) * sparse.csr_array(sparse.kron(down, across, format="csr"))
 

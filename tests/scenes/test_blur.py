@@ -176,7 +176,7 @@ def compare(
     ratio: float, offsets: list[int], unit: int, blur: Blur, second: Callable[[float, float], float]
 ) -> tuple[Numbers, Numbers]:
     """T at pairs of offsets, and by a second method of (y, x)."""
-    result = transfer(ratio, np.array(offsets), unit, blur)
+    result = transfer((ratio, ratio), np.array(offsets), unit, blur)
     start = [(position / unit - 1 + ratio) / 2 for position in offsets]
     return result, np.array([[second(y, x) for x in start] for y in start])
 
@@ -205,12 +205,22 @@ def test_airy_against_fourier(ratio: float, offsets: list[int], unit: int, blur:
     np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("blur", [Blur(0.0), Blur(1.3), Blur(0.7, 0.3), Blur(airy=0.3), Blur(2.0, 0.3, 0.05)])
+def test_a_tall_footprint_is_the_mean_of_three_square_ones(blur: Blur) -> None:
+    offsets = np.arange(0, 12, 2)
+    tall = transfer((3.0, 1.0), offsets, 1, blur)
+    squares = transfer((1.0, 1.0), np.arange(0, 14, 2), 1, blur)
+    above, below = squares[np.abs(np.arange(6) - 1)], squares[1:]
+    np.testing.assert_allclose(tall, (above + squares[:6] + below)[:, :6] / 3, atol=1e-12)
+
+
+@pytest.mark.parametrize("sides", [(3.0, 3.0), (1.0, 3.0), (2.5, 1.5)])
 @pytest.mark.parametrize("blur", [Blur(1.3), Blur(0.7, 0.3), Blur(airy=0.3), Blur(2.0, 0.3, 0.05)])
-def test_steepness_is_the_derivative_of_transfer(blur: Blur) -> None:
+def test_steepness_is_the_derivative_of_transfer(blur: Blur, sides: tuple[float, float]) -> None:
     unit, positions = 1000, np.array([0, 400, 2000, 2600, 3999, 5200])
     offsets = np.concatenate([positions, positions + 2, np.abs(positions - 2)])  # h = 1 / unit; T is symmetric
-    after, before = np.split(transfer(3.0, offsets, unit, blur)[:, : positions.size], 3)[1:]
-    result = steepness(3.0, positions, unit, blur.spread_density)
+    after, before = np.split(transfer(sides, offsets, unit, blur)[:, : positions.size], 3)[1:]
+    result = steepness(sides, positions, unit, blur.spread_density)
     np.testing.assert_allclose(result, (after - before) * unit / 2, rtol=0, atol=1e-5)
 
 

@@ -79,7 +79,9 @@ def test_many_waves_are_a_disk_of_rays() -> None:
     np.testing.assert_allclose(psf.spread.integral(np.sqrt(shares) * rim), shares, atol=1e-2)
     assert psf.spread.integral(np.array([1.05 * rim]))[0] > 0.98
     ratio, offsets, disk = 3.0, np.array([0, 4, 10, 16, 24]), 40.0
-    waves, rays = (transfer(ratio, offsets, 1, Blur(disk, airy, 0.02)) for airy in (disk / (8 * np.pi * 95), 0.0))
+    waves, rays = (
+        transfer((ratio, ratio), offsets, 1, Blur(disk, airy, 0.02)) for airy in (disk / (8 * np.pi * 95), 0.0)
+    )
     np.testing.assert_allclose(waves, rays, rtol=0.02)
 
 

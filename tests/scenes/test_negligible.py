@@ -252,7 +252,7 @@ def test_without_shot_noise_no_photon_is_drawn_and_one_estimate_suffices(monkeyp
 @pytest.mark.parametrize("side", [0.1, 1.0, 3.0, 10.0])
 def test_the_light_that_a_pixel_keeps_is_an_entry_of_h(side: float) -> None:
     """By Parseval, against the entry of a footprint and a texel of one size, integrated over the Airy pattern."""
-    kept = transfer(1.0, np.array([0]), 1, Blur(airy=1 / (np.pi * side)))[0, 0]
+    kept = transfer((1.0, 1.0), np.array([0]), 1, Blur(airy=1 / (np.pi * side)))[0, 0]
     assert light_kept_in_focus(side) == pytest.approx(kept, abs=1e-9)
 
 

@@ -225,7 +225,7 @@ def test_grids_fit_and_rounding_inverts() -> None:
             assert work.total >= samples
             assert work.samples <= 4096
     values = np.array([3.0, 255.0])
-    assert cells_of(derive(auto()).types[0].ratio) == 3
+    assert cells_of(derive(auto()).types[0]) == 3
     for samples in (64, 1024, 4096):
         variance = rounding_variance(values, samples)
         assert samples - 1 <= samples_within(values, variance) <= samples, "rounded down"

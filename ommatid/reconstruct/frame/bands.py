@@ -418,10 +418,10 @@ def _by_kernel(lens_type: LensType, kernel: FloatArray, detail: int) -> Readings
 
 def _box(lens_type: LensType) -> FloatArray:
     """Return the reading by a box in the middle of a pixel's footprint: (rows, columns) of the pixel's whole width."""
-    side, width = float(lens_type.footprint), ceil(lens_type.ratio)
-    edges: FloatArray = np.clip(np.arange(width + 1.0) - width / 2, -side / 2, side / 2)
-    share = np.diff(edges) / side
-    return np.outer(float(lens_type.light) * share, share)
+    middles = np.arange(ceil(lens_type.ratio) + 1.0) - ceil(lens_type.ratio) / 2
+    sides = [float(side) for side in lens_type.footprint]
+    down, across = (np.diff(np.clip(middles, -side / 2, side / 2)) / side for side in sides)
+    return np.outer(float(lens_type.light) * down, across)
 
 
 def _boxes(lens_type: LensType) -> Readings:
@@ -429,11 +429,12 @@ def _boxes(lens_type: LensType) -> Readings:
     ratio, axes = lens_type.ratio, list[FloatArray]()
     first, count = list[int](), list[int]()
     for axis, (start, end) in enumerate(lens_type.bounds):
-        first.append(floor(start + lens_type.inset))
-        count.append(max(floor(end + lens_type.inset - ratio - first[axis]) + 1, 1))
+        inset = lens_type.inset[axis]
+        first.append(floor(start + inset))
+        count.append(max(floor(end + inset - ratio - first[axis]) + 1, 1))
         views = product(lens_type.starts(axis), range(lens_type.pixels[axis]))
-        places = [float((view + lens_type.inset + ratio * n) % 1) for view, n in views]
-        axes.append(_mean_power(float(lens_type.footprint), places))
+        places = [float((view + inset + ratio * n) % 1) for view, n in views]
+        axes.append(_mean_power(float(lens_type.footprint[axis]), places))
     kernels = float(lens_type.light) * np.einsum("ax,by->abxy", *axes)
     kernels = kernels.reshape(-1, axes[0].shape[1], axes[1].shape[1])
     power = np.square(kernels).sum(axis=(1, 2))

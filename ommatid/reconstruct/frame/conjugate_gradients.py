@@ -430,8 +430,8 @@ def leaves_null_space(camera: Camera) -> bool:
 
     Two of them leave 2 (m - 1) (n - 1) dimensions and more (docs/equations.md), and errors that reach far.
     """
-    sides = {lens_type.footprint for lens_type in camera.types}
-    whole = sorted(int(side) for side in sides if side.denominator == 1)
+    squares = {down for down, across in (lens_type.footprint for lens_type in camera.types) if down == across}
+    whole = sorted(int(side) for side in squares if side.denominator == 1)
     return (
         not any(
             np.gcd(a, b) == np.gcd(a, c) == np.gcd(b, c) == 1

@@ -131,7 +131,7 @@ def _sub_images(stack: Stack) -> list[OverviewPanel]:
         sub, image = members[len(members) // 2]
         rows, columns = lens_type.array
         name = f"Type {lens_type.name}, sub-image {sub.k}, {sub.l} of {rows} x {columns}"
-        masked = "" if lens_type.open == 1 else f", pixels open by {lens_type.open}"
+        masked = "" if lens_type.is_open else f", pixels open by {lens_type.opening}"
         panels.append(OverviewPanel(f"{name}\nmagnification {1 / lens_type.ratio}{masked}", image, "recorded"))
     return panels
 

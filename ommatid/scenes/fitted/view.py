@@ -103,10 +103,15 @@ def displacements(
     middle = sub.type.middle(sub.window)
     axis = camera.rows / 2 - sub.lens[1] / camera.target_pitch, camera.columns / 2 - sub.lens[0] / camera.target_pitch
     aside = down + middle[0] - axis[0], across + middle[1] - axis[1]
-    over = float(sub.type.footprint) ** 2 / 3  # mean of (x^2 + y^2) x over a footprint less its middle's
-    square = (np.square(aside[0]) + np.square(aside[1]) + over) * (camera.target_pitch / camera.half_diagonal) ** 2
-    rows = np.column_stack([ones, none, -down, across, -aside[0] * square])
-    columns = np.column_stack([none, ones, -across, -down, -aside[1] * square])
+    tall, wide = (float(side) ** 2 for side in sub.type.footprint)
+    scale = (camera.target_pitch / camera.half_diagonal) ** 2
+    # Means of (x^2 + y^2) y and of (x^2 + y^2) x over a footprint, not those of its middle.
+    upward, sideways = (
+        (np.square(aside[0]) + np.square(aside[1]) + (3 * along + beside) / 12) * scale
+        for along, beside in ((tall, wide), (wide, tall))
+    )
+    rows = np.column_stack([ones, none, -down, across, -aside[0] * upward])
+    columns = np.column_stack([none, ones, -across, -down, -aside[1] * sideways])
     return rows, columns
 
 
@@ -139,9 +144,11 @@ def real_box(shape: tuple[int, int], sub: SubImager, numbers: FloatArray) -> Box
     ratio = float(sub.type.ratio) / (1 + float(numbers[MAGNIFICATION]))
     middle = sub.type.middle(sub.window)
     alone = replace(sub.type, array=(1, 1), steered=())
-    length = float(sub.type.open) * ratio
     axes: list[sparse.csr_array] = []
-    for pixels, centre, number, size in zip(sub.type.pixels, middle, (ROW, COLUMN), shape, strict=True):
+    for axis, (pixels, centre, number, size) in enumerate(
+        zip(sub.type.pixels, middle, (ROW, COLUMN), shape, strict=True)
+    ):
+        length = float(sub.type.open[axis]) * ratio
         start = centre + float(numbers[number]) - ratio * pixels / 2 + (ratio - length) / 2
         axes.append(real_overlap(start + ratio * np.arange(pixels, dtype=np.float64), length, size))
     axes[0].data *= float(sub.type.light)

@@ -58,16 +58,18 @@ class FootprintAssignment:
     def reached(self, row: int, column: int) -> tuple[IntArray, FloatArray]:
         """Sensor pixels that a source may reach, and the distances of their footprints: (n,) each.
 
-        The distance is the larger one along rows and columns, in pixels of f, minus half a footprint.
+        The distance is the larger one along rows and columns from the edge of the footprint, in pixels of f.
         """
         pixels: list[IntArray] = []
         distances: list[FloatArray] = []
         for measurements, box, middles in self._parts:
-            half = float(box.lens_type.footprint) / 2
-            down, across = (np.abs(of - (at + 0.5)) for of, at in zip(middles, (row, column), strict=True))
-            rows, columns = (np.flatnonzero(of < half + self.margin + 0.5 - TIE) for of in (down, across))
+            down, across = (
+                np.abs(of - (at + 0.5)) - float(side) / 2
+                for of, at, side in zip(middles, (row, column), box.lens_type.footprint, strict=True)
+            )
+            rows, columns = (np.flatnonzero(of < self.margin + 0.5 - TIE) for of in (down, across))
             pixels.append(measurements.start + box.numbers(rows, columns))
-            distances.append(np.maximum(down[rows][:, None], across[columns]).ravel() - half)
+            distances.append(np.maximum(down[rows][:, None], across[columns]).ravel())
         return np.concatenate(pixels), np.concatenate(distances)
 
     def nearest_sources(self, positions: IntArray, file: Path) -> tuple[IntArray, IntArray]:

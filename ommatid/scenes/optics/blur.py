@@ -18,6 +18,7 @@ radius.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from math import ceil, lcm
@@ -142,16 +143,16 @@ def matrix(camera: Camera, lens_type: LensType, *blurs: tuple[Blur, float]) -> s
     the variation within a sensor pixel, and the share `diffraction.TAIL` of the light, which lands further out.
     """
     reach = max(blur.reach for blur, _ in blurs)
-    numbers = lens_type.ratio, lens_type.footprint, *lens_type.step, *lens_type.origin
+    numbers = lens_type.ratio, *lens_type.footprint, *lens_type.step, *lens_type.origin
     unit = lcm(*(number.denominator for number in numbers))
     down, across = (_axis(camera, lens_type, reach, axis, unit) for axis in (0, 1))
     offsets = np.unique(np.abs(np.concatenate([down.offset.ravel(), across.offset.ravel()])))  # symmetric
-    table, slope = _tables(camera, lens_type, offsets, unit, blurs)
+    table, *asymmetry = _tables(camera, lens_type, offsets, unit, blurs)
     data: list[FloatArray] = []
     indices: list[IntArray] = []
     counts: list[IntArray] = []
     for k in range(lens_type.array[0]):
-        values = _block(down, across, k, offsets, table, slope)
+        values = _block(down, across, k, offsets, table, asymmetry)
         lit = values > 0
         texels = down.cells[k][None, :, None, :, None] * camera.columns + across.cells[:, None, :, None, :]
         data.append(values[lit])
@@ -163,20 +164,22 @@ def matrix(camera: Camera, lens_type: LensType, *blurs: tuple[Blur, float]) -> s
     return sparse.csr_array((values, np.concatenate(indices), pointers), shape=shape)
 
 
-def _tables(
-    camera: Camera, lens_type: LensType, offsets: IntArray, unit: int, blurs: Blurs
-) -> tuple[FloatArray, FloatArray | None]:
-    """Entries of H for all pairs of offsets down and across, and their slope of `_asymmetry` if any: (n, n) each."""
+def _tables(camera: Camera, lens_type: LensType, offsets: IntArray, unit: int, blurs: Blurs) -> tuple[FloatArray, ...]:
+    """Entries of H for all pairs of offsets down and across, and their slopes of `_asymmetry` if any: (n, n) each."""
     needed = TABLES * 8 * offsets.size**2
     check_memory(needed, f"camera.lens.{lens_type.name}: its blur", "take simpler ratios, or less blur")
-    reach, ratio = max(blur.reach for blur, _ in blurs), float(lens_type.footprint)
-    gap = np.maximum(offsets - unit - int(lens_type.footprint * unit), 0) / (2 * unit)
-    lit = np.hypot.outer(gap, gap) < max(reach, np.finfo(float).tiny)
-    table = np.where(lit, sum(share * transfer(ratio, offsets, unit, blur) for blur, share in blurs), 0.0)
+    reach, (tall, wide) = max(blur.reach for blur, _ in blurs), map(float, lens_type.footprint)
+    gaps = [np.maximum(offsets - unit - int(side * unit), 0) / (2 * unit) for side in lens_type.footprint]
+    lit = np.hypot.outer(*gaps) < max(reach, np.finfo(float).tiny)
+    table = np.where(lit, sum(share * transfer((tall, wide), offsets, unit, blur) for blur, share in blurs), 0.0)
     slanted = [(blur, share) for blur, share in blurs if blur.disk and blur.weight]
-    slopes = (share * _asymmetry(camera, lens_type, blur, offsets, unit) for blur, share in slanted)
-    slope = sum(slopes, np.zeros_like(table))
-    return table, np.where(lit, slope, 0.0) if slanted else None
+    if not slanted:
+        return (table,)
+    upward, sideways = (
+        sum(share * _asymmetry(camera, lens_type, blur, sides, offsets, unit) for blur, share in slanted)
+        for sides in ((tall, wide), (wide, tall))
+    )
+    return table, np.where(lit, upward, 0.0), np.where(lit, np.transpose(sideways), 0.0)
 
 
 def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
@@ -188,14 +191,14 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
     places = KernelPlaces(camera, lens_type, ceil(max(blur.reach for blur, _ in blurs)))
     beside = 2 * np.arange(places.width) + 1 - places.width  # from the footprint's middle, in halves of a pixel
     offsets, index = np.unique(np.abs(beside), return_inverse=True)
-    unit, light = lens_type.footprint.denominator, float(lens_type.light)
-    table, slope = _tables(camera, lens_type, unit * offsets, unit, blurs)
+    unit, light = lcm(*(side.denominator for side in lens_type.footprint)), float(lens_type.light)
+    table, *asymmetry = _tables(camera, lens_type, unit * offsets, unit, blurs)
     mean = table[np.ix_(index, index)]
-    if slope is None:
+    if not asymmetry:
         return KernelFootprints(places, 0, KernelShapes.dense(mean[None]), np.full((1, 1), light), np.zeros((0, 0, 1)))
-    upward = np.sign(beside)[:, None] * slope[np.ix_(index, index)]
+    upward, sideways = (slope[np.ix_(index, index)] for slope in asymmetry)
     weights = np.diag([1.0, places.scale, places.scale])  # Legendre's P1 is the coordinate itself
-    shapes = KernelShapes.dense(np.stack([mean, upward, upward.T]))
+    shapes = KernelShapes.dense(np.stack([mean, np.sign(beside)[:, None] * upward, sideways * np.sign(beside)]))
     return KernelFootprints(places, 1, shapes, light * weights, np.zeros((0, 0, 3)))
 
 
@@ -205,30 +208,33 @@ def entries(camera: Camera, lens_type: LensType, reach: float) -> int:
     return lens_type.measurements * tall * wide
 
 
-def transfer(ratio: float, offsets: IntArray, unit: int, blur: Blur) -> FloatArray:
+Sides = tuple[float, float]  # of a footprint, down and across, in pixels of f
+
+
+def transfer(sides: Sides, offsets: IntArray, unit: int, blur: Blur) -> FloatArray:
     """T for all pairs of offsets between the middles of a texel and of a footprint along the two axes: (n, n).
 
-    offsets : (n,) in halves of 1 / unit, a unit in which footprints of `ratio` are whole numbers
+    sides : of the footprint;  offsets : (n,) in halves of 1 / unit, a unit in which the sides are whole numbers
     """
-    trapezoid, _ = _trapezoid(ratio, offsets, unit)
-    sharp = np.outer(trapezoid, trapezoid)
+    (tall, _), (wide, _) = (_trapezoid(side, offsets, unit) for side in sides)
+    sharp = np.outer(tall, wide)
     if blur.is_zero:
         return sharp
-    kinks, even, _ = _differences(ratio, offsets, unit)
+    kinks, (down, _), (across, _) = _differences(sides, offsets, unit)
     density = blur.spread_density
     beyond, corner = moments(kinks, density)
-    widened = np.outer(trapezoid, even @ beyond)
-    return density.mass * sharp + widened + widened.T + even @ corner @ even.T
+    widened = np.outer(tall, across @ beyond) + np.outer(down @ beyond, wide)
+    return density.mass * sharp + widened + down @ corner @ across.T
 
 
-def steepness(ratio: float, offsets: IntArray, unit: int, density: RadialDensity) -> FloatArray:
-    """The derivative by y, its first coordinate, of T of displacements with a density; offsets as of `transfer`."""
-    trapezoid, steep = _trapezoid(ratio, offsets, unit)
-    kinks, even, odd = _differences(ratio, offsets, unit)
+def steepness(sides: Sides, offsets: IntArray, unit: int, density: RadialDensity) -> FloatArray:
+    """The derivative by y, its first coordinate, of T of displacements with a density; parameters as of `transfer`."""
+    (_, steep), (wide, _) = (_trapezoid(side, offsets, unit) for side in sides)
+    kinks, (_, odd), (across, _) = _differences(sides, offsets, unit)
     beyond, _ = moments(kinks, density)
     lower, corner = slopes(kinks, density)
-    steep = np.outer(steep, density.mass * trapezoid + even @ beyond)
-    return steep + np.outer(odd @ lower, trapezoid) + odd @ corner @ even.T
+    inside = np.outer(steep, density.mass * wide + across @ beyond)
+    return inside + np.outer(odd @ lower, wide) + odd @ corner @ across.T
 
 
 def _kinks(ratio: float, offsets: IntArray, unit: int) -> IntArray:
@@ -243,20 +249,29 @@ def _trapezoid(ratio: float, offsets: IntArray, unit: int) -> tuple[FloatArray, 
     return (np.abs(kinks) @ SIGNS) / (4 * round(ratio * unit)), (np.sign(kinks) @ SIGNS) / (2 * ratio)
 
 
-def _differences(ratio: float, offsets: IntArray, unit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Absolute values of all kinks, (k,), and the matrices D / m for even and odd functions of them: (n, k) each."""
-    kinks = _kinks(ratio, offsets, unit)
+def _differences(
+    sides: Sides, offsets: IntArray, unit: int
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """Absolute values of all kinks, (k,), and for both sides matrices D / m for even and odd functions: (n, k) each."""
+    kinks = np.stack([_kinks(side, offsets, unit) for side in sides])
     values, index = np.unique(np.abs(kinks), return_inverse=True)
-    even, odd = (np.zeros((offsets.size, values.size)) for _ in range(2))
-    at = np.arange(offsets.size)[:, None], index.reshape(kinks.shape)
-    np.add.at(even, at, SIGNS / ratio)
-    np.add.at(odd, at, SIGNS * np.sign(kinks) / ratio)
-    return values / (2 * unit), even, odd
+    at = np.arange(offsets.size)[:, None]
+
+    def matrices(axis: int) -> tuple[FloatArray, FloatArray]:
+        even, odd = (np.zeros((offsets.size, values.size)) for _ in range(2))
+        where = at, index.reshape(kinks.shape)[axis]
+        np.add.at(even, where, SIGNS / sides[axis])
+        np.add.at(odd, where, SIGNS * np.sign(kinks[axis]) / sides[axis])
+        return even, odd
+
+    return values / (2 * unit), matrices(0), matrices(1)
 
 
-def _asymmetry(camera: Camera, lens_type: LensType, blur: Blur, offsets: IntArray, unit: int) -> FloatArray:
+def _asymmetry(
+    camera: Camera, lens_type: LensType, blur: Blur, sides: Sides, offsets: IntArray, unit: int
+) -> FloatArray:
     """Change of an entry of H per pixel of f between a lens and the footprint of its pixel, along y: (n, n)."""
-    inside = steepness(float(lens_type.footprint), offsets, unit, blur.slant_density)
+    inside = steepness(sides, offsets, unit, blur.slant_density)
     # A pixel at s sees the pupil's amplitude 2 s sqrt(weight) / depth brighter at the rim on its side.
     lever = 2 * np.sqrt(blur.weight) * camera.target_pitch / camera.distance_of(lens_type)
     return -np.sign(1 - camera.distance_of(lens_type) / camera.focus(lens_type)) * lever * inside
@@ -291,17 +306,17 @@ def _axis(camera: Camera, lens_type: LensType, reach: float, axis: int, unit: in
 
 
 def _block(
-    down: _Axis, across: _Axis, k: int, offsets: IntArray, table: FloatArray, slope: FloatArray | None
+    down: _Axis, across: _Axis, k: int, offsets: IntArray, table: FloatArray, asymmetry: Sequence[FloatArray]
 ) -> FloatArray:
     """Entries of the sub-imagers of row k, texels within reach: (L, rows, columns, texels down, texels across)."""
     y, x = down.offset[k : k + 1, :, None, :, None], across.offset[:, None, :, None, :]
     row, column = np.searchsorted(offsets, np.abs(y)), np.searchsorted(offsets, np.abs(x))
     values = table[row, column]
-    if slope is None:
+    if not asymmetry:
         return values
     upward = np.sign(y) * down.beside[k][None, :, None, None, None]
     sideways = np.sign(x) * across.beside[:, None, :, None, None]
-    return values + upward * slope[row, column] + sideways * slope[column, row]
+    return values + upward * asymmetry[0][row, column] + sideways * asymmetry[1][row, column]
 
 
 def _reached(lens_type: LensType, reach: float, size: int) -> int:

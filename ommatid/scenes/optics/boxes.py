@@ -147,7 +147,7 @@ def designed_box(shape: tuple[int, int], lens_type: LensType) -> Box:
 
 def _axis(size: int, lens_type: LensType, axis: int) -> BoxAxis:
     ratio, pixels, starts = lens_type.ratio, lens_type.pixels[axis], lens_type.starts(axis)
-    parts = [overlap(ratio, pixels, start, size, lens_type.open) for start in starts]
+    parts = [overlap(ratio, pixels, start, size, lens_type.open[axis]) for start in starts]
     return BoxAxis(sparse.csr_array(sparse.vstack(parts, format="csr")))
 
 

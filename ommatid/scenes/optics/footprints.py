@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
 from functools import partial
 from math import lcm
 
@@ -25,7 +26,7 @@ from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.machine import processors
 
 from ..camera import Camera
-from ..lens_type import LensType, SubImager
+from ..lens_type import SubImager
 from ..pose import Pose, corner_offset
 from .distortion import coefficients, distort, field
 
@@ -62,8 +63,9 @@ def sub_matrix(camera: Camera, sub: SubImager, pose: Pose) -> sparse.csr_array:
         return np.stack([u, v]) / np.where(w < LEAST_DEPTH, np.nan, w)
 
     parts = _parts(image, camera.shape) if any(k) else 1
-    division, opening = _opening(sub.type)
-    pixels_divided = sub.type.pixels[0] * division, sub.type.pixels[1] * division
+    openings = [_opening(part) for part in sub.type.open]
+    pixels_divided = sub.type.pixels[0] * openings[0].size, sub.type.pixels[1] * openings[1].size
+    division = np.array([openings[1].size, openings[0].size])[:, None, None, None]  # of U and of V
     tall = max(1, BLOCK // (camera.columns * parts))
     blocks: list[sparse.csc_array] = []
     for top in range(0, camera.rows, tall):
@@ -75,20 +77,23 @@ def sub_matrix(camera: Camera, sub: SubImager, pose: Pose) -> sparse.csr_array:
     h = sparse.csr_array(sparse.hstack(blocks, format="csr"))
     h.data[h.data < LEAST_SHARE] = 0
     h.eliminate_zeros()
-    if division > 1:
-        down, across = (sparse.kron(sparse.eye_array(count), opening[None]) for count in sub.type.pixels)
+    if not sub.type.is_open:
+        down, across = (
+            sparse.kron(sparse.eye_array(count), opening[None])
+            for count, opening in zip(sub.type.pixels, openings, strict=True)
+        )
         h = sparse.csr_array(sparse.kron(down, across, format="csr") @ h)
     return float(sub.type.light) * h
 
 
-def _opening(lens_type: LensType) -> tuple[int, FloatArray]:
-    """Return into how many parts a side of a pixel is divided, and the weight of each in its mean along that side."""
-    beside = (1 - lens_type.open) / 2
-    division = lcm(lens_type.open.denominator, beside.denominator)
-    inside, closed = int(lens_type.open * division), int(beside * division)
+def _opening(part: Fraction) -> FloatArray:
+    """Return the weights, in the mean along a side of a pixel that is open in part, of the parts it is divided into."""
+    beside = (1 - part) / 2
+    division = lcm(part.denominator, beside.denominator)
+    inside, closed = int(part * division), int(beside * division)
     weights = np.zeros(division)
     weights[closed : closed + inside] = 1 / inside
-    return division, weights
+    return weights
 
 
 def matrix(camera: Camera, poses: tuple[Pose, ...]) -> sparse.csr_array:

@@ -212,7 +212,7 @@ def change_by_diffraction(camera: Camera, lens_type: LensType, aperture: float, 
     waves, rays = Blur(disk, airy), Blur(disk)
     if waves.waves > MOST_WAVES:
         waves = rays
-    kept = [float(transfer(1.0, np.array([0]), 1, blur)[0, 0]) for blur in (waves, rays)]
+    kept = [float(transfer((1.0, 1.0), np.array([0]), 1, blur)[0, 0]) for blur in (waves, rays)]
     return WHITE * min(1.0, sum(1 - share for share in kept))
 
 

@@ -157,7 +157,8 @@ class LensTable(Table):
         description="reflectance of each surface to air; absent: uncoated, by Fresnel's equations",
     )
     fill_factor: FillFactor | None = Field(
-        default=None, description="side of the open part of a sensor pixel over its pitch; absent: the camera's"
+        default=None,
+        description="side of the open part of a sensor pixel over its pitch, or height and width; absent: the camera's",
     )
     sub_imager: (
         Annotated[tuple[SubImagerTable, ...], at_most(MOST_SUB_IMAGERS, "sub_imager tables"), Field(min_length=1)]
@@ -253,9 +254,9 @@ class CameraTable(Table):
     )
     tolerance: ToleranceTable | None = Field(default=None, description="misalignment of the sub-imagers; absent: none")
     fill_factor: FillFactor = Field(
-        default=Fraction(1),
-        exclude_if=lambda value: value == 1,
-        description="side of the square open part of every sensor pixel, in its middle, over the pitch",
+        default=(Fraction(1), Fraction(1)),
+        exclude_if=lambda value: value == (1, 1),
+        description="side of the open part of every sensor pixel, in its middle, over the pitch; or height and width",
     )
     fill_light: Literal["lost", "kept"] = Field(
         default="lost",

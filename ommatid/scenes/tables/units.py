@@ -137,14 +137,16 @@ def _magnification(value: object) -> Fraction:
     return ratio
 
 
-def _fill_factor(value: object) -> Fraction:
-    ratio = _ratio(value)
-    if not 0 < ratio <= 1 or ratio.denominator > FINEST_PART:
-        raise ValueError(
-            f'expected a fill factor above 0 and at most 1 with a denominator of {FINEST_PART} or less, such as "2/3",'
-            f" got {shortened_repr(value)}"
-        )
-    return ratio
+def _fill_factor(value: object) -> tuple[Fraction, Fraction]:
+    sides = cast(object, value) if isinstance(value, list | tuple) else (value, value)
+    expected = (
+        f'expected a fill factor above 0 and at most 1 with a denominator of {FINEST_PART} or less, such as "2/3", or'
+        ' two, down and across, such as ["2/3", 1]'
+    )
+    ratios = _two_ratios(sides, expected)
+    if not all(0 < ratio <= 1 and ratio.denominator <= FINEST_PART for ratio in ratios):
+        raise ValueError(f"{expected}, got {shortened_repr(cast(object, value))}")
+    return ratios
 
 
 def _two_ratios(value: object, expected: str) -> tuple[Fraction, Fraction]:
@@ -249,7 +251,7 @@ Illuminance = Annotated[
     float, Quantity("lux", "an illuminance", ("500 lux", "1 klux"), 'an illuminance, such as "500 lux"')
 ]
 Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_plain_ratio), _RATIO]
-FillFactor = Annotated[Fraction, BeforeValidator(_fill_factor), PlainSerializer(_plain_ratio), _RATIO]
+FillFactor = Annotated[tuple[Fraction, Fraction], BeforeValidator(_fill_factor), PlainSerializer(_plain_step), _STEP]
 Step = Annotated[tuple[Fraction, Fraction], BeforeValidator(_step), PlainSerializer(_plain_step), _STEP]
 Window = Annotated[
     tuple[Fraction, Fraction],

@@ -93,10 +93,7 @@ def calibrate_until(
 def plans_of(setup: Setup, samples: int, float64: bool) -> Plans:
     """Return plans of about `samples` per pixel, by lens type, on grids that fit the edges of pixels of f."""
     most, sampler = MOST_EXACT if float64 else MOST_SAMPLES, setup.scene.render.sampler
-    return {
-        lens_type.name: on_grid(samples, sampler, cells_of(lens_type.footprint), most)
-        for lens_type in setup.camera.types
-    }
+    return {lens_type.name: on_grid(samples, sampler, cells_of(lens_type), most) for lens_type in setup.camera.types}
 
 
 def _next(tried: list[dict[str, Any]], exponent: float, most: int) -> int:

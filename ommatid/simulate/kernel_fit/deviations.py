@@ -54,6 +54,11 @@ class Chart:
         """Where the kernels lie."""
         return self.designed.places
 
+    @property
+    def is_square(self) -> bool:
+        """True if sensor pixels are open by squares."""
+        return len(set(self.places.lens_type.open)) == 1
+
     @cached_property
     def field(self) -> FloatArray:
         """Positions (u, v) of the footprints: (n, 2)."""

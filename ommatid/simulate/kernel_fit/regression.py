@@ -1,13 +1,13 @@
 """Least squares of the kernels' cells on polynomials of the field.
 
 Every cell is fitted from sums over the pixels of the chart. A lens that is symmetric about its axis shows the same
-picture mirrored at mirrored positions of the field, and transposed at transposed ones, on a grid of squares exactly.
-Averaging the sums over these eight operations gives the fit of all pixels and their images at once.
+picture mirrored at mirrored positions of the field, and transposed at transposed ones if pixels are open by squares.
+Averaging the sums over these operations, eight or four, gives the fit of all pixels and their images at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -30,7 +30,7 @@ class Sums:
 
     products : (C, P, P) of two terms over the pixels that see a cell;  entries : (k, C, P) of terms and entries, those
     of the mean first, then those of the batches' deviations;  whole : (P, P) of two terms over all pixels
-    core : w, of the w^2 cells before those of the rings
+    core : w, of the w^2 cells before those of the rings;  is_square : True if pixels are open by squares
     """
 
     products: FloatArray
@@ -38,17 +38,19 @@ class Sums:
     whole: FloatArray
     degree: int
     core: int
+    is_square: bool
 
     @property
     def symmetric(self) -> Sums:
-        """The mean over the chart and its seven images."""
+        """The mean over the chart and its images."""
         products, entries, whole = (np.zeros_like(each) for each in (self.products, self.entries, self.whole))
-        for index, sign, turn in _operations(self.degree):
+        turns = [*product((False, True), (False, True), (False, True) if self.is_square else (False,))]
+        for index, sign, turn in _operations(self.degree, turns):
             signs = sign[:, None] * sign
             products += self._turned(self.products, turn, 0)[:, index[:, None], index] * signs
             entries += self._turned(self.entries, turn, 1)[..., index] * sign
             whole += self.whole[index[:, None], index] * signs
-        return replace(self, products=products / 8, entries=entries / 8, whole=whole / 8)
+        return replace(self, products=products / len(turns), entries=entries / len(turns), whole=whole / len(turns))
 
     def _turned(self, sums: FloatArray, turn: Turn, axis: int) -> FloatArray:
         """Transpose and then mirror the cells of the core, which lie along an axis; the rings stay as they are."""
@@ -88,7 +90,7 @@ def sums_of(chart: Chart, degree: int) -> Sums:
     pairs = (x[:, :, None] * x[:, None]).reshape(pixels, -1)
     products = (pairs.T @ np.square(chart.inside)).T.reshape(cells, count, count)
     entries = [(x.T @ (each * chart.inside)).T for each in (chart.values, *chart.batches)]
-    return Sums(products, np.array(entries), x.T @ x, degree, chart.core)
+    return Sums(products, np.array(entries), x.T @ x, degree, chart.core, chart.is_square)
 
 
 def residual(sums: Sums, coefficients: FloatArray) -> Sums:
@@ -124,10 +126,10 @@ def excess(products: FloatArray) -> float:
     return float(products[0, 0]) / noise - 1 if noise > 0 else 0.0
 
 
-def _operations(degree: int) -> Iterator[tuple[IntArray, FloatArray, Turn]]:
+def _operations(degree: int, turns: Sequence[Turn]) -> Iterator[tuple[IntArray, FloatArray, Turn]]:
     """Yield the term and the sign that each term becomes, and the mirrorings down, across and the transposition."""
     pairs = terms(degree)
-    for turn in product((False, True), repeat=3):
+    for turn in turns:
         mirrored_down, mirrored_across, transposed = turn
         index = np.array([pairs.index((b, a) if transposed else (a, b)) for a, b in pairs])
         sign = np.array([(-1.0) ** (a * mirrored_down + b * mirrored_across) for a, b in pairs])

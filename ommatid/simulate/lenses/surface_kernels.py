@@ -63,7 +63,7 @@ class _FieldRows:
 
     def _row(self, field: LensField, x: float, y: float, beside: FloatArray) -> FloatArray:
         camera, wide = self.places.camera, self.places.width
-        edges = _edges(camera, field, x, y, float(self.places.lens_type.open)) - (beside - wide / 2)[:, None]
+        edges = _edges(camera, field, x, y, self.places.lens_type) - (beside - wide / 2)[:, None]
         angle, height = float(np.arctan2(-x, y)), float(np.hypot(x, y))
         if field.rays_suffice:
             total = np.zeros((wide, wide))
@@ -83,9 +83,9 @@ class _FieldRows:
         nodes : in the unit interval;  ends : with the field's edges, else on the whole of it
         """
         axes = [np.append(nodes[nodes < last], last) if ends else last * nodes for last in self.places.extent]
-        known: dict[tuple[float, float], FloatArray] = {}
+        known, is_square = dict[tuple[float, float], FloatArray](), len(set(self.places.lens_type.open)) == 1
         for u, v in product(*(axis.tolist() for axis in axes)):
-            known[u, v] = known[v, u].T if (v, u) in known else self.at(u, v)
+            known[u, v] = known[v, u].T if is_square and (v, u) in known else self.at(u, v)
         return np.array(list(known)), np.stack([row.ravel() for row in known.values()])
 
 
@@ -94,10 +94,10 @@ def _nodes(count: int) -> FloatArray:
     return (1 + np.polynomial.legendre.leggauss(count)[0]) / 2
 
 
-def _edges(camera: Camera, field: LensField, x: float, y: float, open_part: float) -> FloatArray:
+def _edges(camera: Camera, field: LensField, x: float, y: float, lens_type: LensType) -> FloatArray:
     """Return the edges of a footprint in pixels of f from the lens's axis, by rows and by columns: (2, 2)."""
-    half = camera.pixel_pitch / 2 * open_part * np.array([-1.0, 1.0])
-    across, down = field.centre(x + half, np.full(2, y))[0], field.centre(np.full(2, x), y + half)[1]
+    tall, wide = (camera.pixel_pitch / 2 * float(part) * np.array([-1.0, 1.0]) for part in lens_type.open)
+    across, down = field.centre(x + wide, np.full(2, y))[0], field.centre(np.full(2, x), y + tall)[1]
     return -np.stack([down, across]) / camera.target_pitch
 
 
@@ -142,8 +142,9 @@ def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[LensField, 
         spot = max(wave.spot_radius for wave in field.nodes[1])
         wide = spot if field.rays_suffice else field.grid[1]
         x, y = (float(each) for each in corner[::-1] * shrink)
-        edges = np.sort(_edges(camera, field, x, y, float(lens_type.open)), axis=1)
-        moved = np.abs(edges - corner[:, None] - float(lens_type.footprint) / 2 * np.array([-1.0, 1.0])).max()
+        edges = np.sort(_edges(camera, field, x, y, lens_type), axis=1)
+        halves = np.outer([float(side) / 2 for side in lens_type.footprint], [-1.0, 1.0])
+        moved = np.abs(edges - corner[:, None] - halves).max()
         reach = max(reach, wide / camera.target_pitch + float(moved))
     return ceil(reach) + 1
 

@@ -76,7 +76,7 @@ def _band(
 
 def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _PixelFootprints:
     parts: list[FloatArray] = []
-    half = camera.pixel_pitch / 2 * float(lens_type.open)
+    tall, wide = (camera.pixel_pitch / 2 * float(part) for part in lens_type.open)
     for sub in camera.sub_imagers:
         if sub.type != lens_type:
             continue
@@ -85,8 +85,8 @@ def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _PixelFoot
         u, v = corner_offset(camera, sub)
         points = pose.axes @ np.stack([u + column * camera.pixel_pitch, v + row * camera.pixel_pitch])
         x, y, _ = pose.middle[:, None] + points
-        left, right = (sub.lens[0] + field.centre(x + step, y)[0] for step in (-half, half))
-        upper, lower = (sub.lens[1] + field.centre(x, y + step)[1] for step in (-half, half))
+        left, right = (sub.lens[0] + field.centre(x + step, y)[0] for step in (-wide, wide))
+        upper, lower = (sub.lens[1] + field.centre(x, y + step)[1] for step in (-tall, tall))
         columns = [camera.columns / 2 - edge / camera.target_pitch for edge in (left, right)]
         rows = [camera.rows / 2 - edge / camera.target_pitch for edge in (upper, lower)]
         parts.append(np.stack([x, y, *rows, *columns]))

@@ -29,14 +29,14 @@ class Averages:
         import drjit as dr
         import mitsuba as mi
 
-        side = lens_type.footprint
-        self._camera, self._box, self._parts = camera, side.numerator, side.denominator
-        fine: FloatArray = np.repeat(np.repeat(picture, self._parts, axis=0), self._parts, axis=1)
-        means = np.full(self._box, 1 / self._box)
-        moments = ((np.arange(self._box) + 0.5) / self._box - 0.5) / self._box
-        down, offset_down = (_over_boxes(fine, weights) for weights in (means, moments))
-        layers = [_over_boxes(lines.T, weights).T for lines, weights in ((down, means), (offset_down, means))]
-        layers.append(_over_boxes(down.T, moments).T)
+        self._camera = camera
+        self._boxes, self._parts = zip(*(side.as_integer_ratio() for side in lens_type.footprint), strict=True)
+        fine: FloatArray = np.repeat(np.repeat(picture, self._parts[0], axis=0), self._parts[1], axis=1)
+        means = [np.full(box, 1 / box) for box in self._boxes]
+        moments = [((np.arange(box) + 0.5) / box - 0.5) / box for box in self._boxes]
+        down, offset_down = (_over_boxes(fine, weights[0]) for weights in (means, moments))
+        layers = [_over_boxes(lines.T, means[1]).T for lines in (down, offset_down)]
+        layers.append(_over_boxes(down.T, moments[1]).T)
         self._shape = layers[0].shape
         data = np.ascontiguousarray(np.stack(layers, axis=-1), dtype=np.float32)
         texture: Any = mi.Texture2f
@@ -55,9 +55,9 @@ class Averages:
         camera, along = self._camera, (self._camera.distance - ray.o.z) / ray.d.z
         middle = [camera.rows / 2 - (ray.o.y + along * ray.d.y) / camera.target_pitch]
         middle.append(camera.columns / 2 - (ray.o.x + along * ray.d.x) / camera.target_pitch)
-        first = self._box / 2 + 0.5
         v, u = (
-            (self._parts * each + first + by) / size for each, by, size in zip(middle, moved, self._shape, strict=True)
+            (parts * each + box / 2 + 0.5 + by) / size
+            for parts, box, each, by, size in zip(self._parts, self._boxes, middle, moved, self._shape, strict=True)
         )
         mean, down, across = self._texture.eval(mi.Point2f(u, v))
         return mean + falloff[0] * down + falloff[1] * across

@@ -66,7 +66,7 @@ class RayGenerator:
         self._placement = MILLIMETRES_AT_ORIGIN
         self._loaded: tuple[slice, list[Any], Any] | None = None  # of the last block of all pixels
         self._pitch = float(camera.pixel_pitch)
-        self._open = float(types[0].open)  # of all of these types,
+        self._open = [float(part) for part in types[0].open]  # of all of these types,
         self._height = camera.height(types[0])  # and so is this
         self._crossing = None
         if not camera.walls:
@@ -137,8 +137,8 @@ class RayGenerator:
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, each)
         x, y, z = (dr.gather(mi.Float, row, index) for row in places[0][:3])
         x, y = x + self._pitch / 2, y + self._pitch / 2
-        slope = -4 * self._open * self._pitch / (x * x + y * y + z * z)  # of cos^4
-        return ray, (slope * y, slope * x)
+        slope = -4 * self._pitch / (x * x + y * y + z * z)  # of cos^4
+        return ray, (self._open[0] * slope * y, self._open[1] * slope * x)
 
     def middles(self, pixels: IntArray) -> Rays:
         """Start the ray from the middle of each of some pixels of the group, of pinholes."""
@@ -187,7 +187,8 @@ class RayGenerator:
 
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, each)
         corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in places[0])
-        at = ((1 - self._open) / 2 + self._open * at) * self._pitch
+        down, across = self._open
+        at = mi.Point2f((1 - across) / 2 + across * at.x, (1 - down) / 2 + down * at.y) * self._pitch
         if axes:
             x = corner_x + axes[0] * at.x + axes[1] * at.y
             y = corner_y + axes[2] * at.x + axes[3] * at.y

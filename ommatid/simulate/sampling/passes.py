@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
-from math import ceil, isqrt
+from math import ceil, isqrt, lcm
 
 import numpy as np
 
@@ -75,9 +75,10 @@ def on_grid(samples: int, sampler: Sampler, cells: int = 1, most: int = MOST_SAM
 _filling = cache(filling)
 
 
-def cells_of(ratio: Fraction) -> int:
-    """Return the number of equal parts that the edges of pixels of f can cut a side of `ratio` pixels of f into."""
-    return ratio.numerator if ratio.numerator <= MOST_CELLS else 1
+def cells_of(lens_type: LensType) -> int:
+    """Return the number of equal parts that edges of pixels of f can cut both sides of a pixel's footprint into."""
+    cells = lcm(*(side.numerator for side in lens_type.footprint))
+    return cells if cells <= MOST_CELLS else 1
 
 
 @dataclass(frozen=True)
@@ -172,22 +173,23 @@ def exact_plan(camera: Camera, index: int, sampler: Sampler, *, fast: bool = Tru
     fast : True if the averages of the picture over its pixels can be had, one a pass
     """
     sub = camera.sub_imagers[index]
-    side = sub.type.footprint
     if sampler not in JITTERED or not sub.type.optics.is_pinhole:
         return None
-    ends = [(start + sub.type.inset) * side.denominator for start in sub.window]
-    ends.append(sub.type.ratio * side.denominator)  # the next pixel begins on the grid, too
-    fits = side.numerator <= MOST_CELLS and all(end.denominator == 1 for end in ends)
+    ends: list[Fraction] = []
+    for start, inset, side in zip(sub.window, sub.type.inset, sub.type.footprint, strict=True):
+        ends += [(start + inset) * side.denominator, sub.type.ratio * side.denominator]  # the next pixel begins there
+    cells = lcm(*(side.numerator for side in sub.type.footprint))
+    fits = cells <= MOST_CELLS and all(end.denominator == 1 for end in ends)
     is_ideal = camera.walls and camera.tolerance is None and not sub.rotation
     if fits and is_ideal and margin(camera, sub.type) <= WIDEST_MARGIN:
-        return Plan(EXACT_PASSES, side.numerator**2)
+        return Plan(EXACT_PASSES, cells**2)
     return AVERAGED if fast and has_equal_boxes(camera, sub.type) else None
 
 
 def has_equal_boxes(camera: Camera, lens_type: LensType) -> bool:
     """Return True if all pixels of a lens type throw equal boxes along the axes of the picture, and not too large."""
-    side, tolerance = lens_type.footprint, camera.tolerance
-    small = side.numerator <= MOST_PIXELS and side.denominator <= MOST_PARTS
+    sides, tolerance = lens_type.footprint, camera.tolerance
+    small = all(side.numerator <= MOST_PIXELS and side.denominator <= MOST_PARTS for side in sides)
     displaced = tolerance is not None and tolerance.displaces and lens_type.optics.is_pinhole
     straight = camera.walls and not lens_type.is_rotated and (tolerance is None or displaced)
     return small and straight and lens_type.optics.surfaces is None and lens_type.optics.distortion is None
@@ -197,4 +199,4 @@ def margin(camera: Camera, lens_type: LensType) -> float:
     """Return by how much of a cell rounding may move the point of the target that a ray of a lens type meets."""
     away = max(abs(place) for sub in camera.sub_imagers for place in sub.lens)
     extent = max(camera.shape) + away / camera.target_pitch  # pixels of f
-    return ROUNDINGS * ROUNDING * extent * lens_type.footprint.denominator
+    return ROUNDINGS * ROUNDING * extent * max(side.denominator for side in lens_type.footprint)

@@ -74,26 +74,28 @@ def _designed_boxes(sub: SubImager) -> bool:
 
 def _boxes(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> FloatArray:
     """Take every footprint for a box, displaced as its middle is by rotation and distortion."""
-    starts, width = _intervals(camera, sub, numbers, chart)
     shares = [
         _overlap(start, width, first, size)
-        for start, first, size in zip(starts, (chart.row, chart.column), chart.values.shape[1:], strict=True)
+        for (start, width), first, size in zip(
+            _intervals(camera, sub, numbers, chart), (chart.row, chart.column), chart.values.shape[1:], strict=True
+        )
     ]
     return shares[0][:, :, None] * shares[1][:, None, :]
 
 
-def _intervals(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> tuple[list[FloatArray], float]:
-    """Return where these boxes begin, in rows and in columns of f, (pixels,) each, and their width."""
+def _intervals(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> list[tuple[FloatArray, float]]:
+    """Return where these boxes begin, in rows and in columns of f, (pixels,) each, and how long they are."""
     down, across = offsets(sub, (chart.down, chart.across))
     moved = (numbers - designed(sub)) * (np.arange(numbers.size) != MAGNIFICATION)
     rows, columns = (each @ moved for each in displacements(camera, sub, (chart.down, chart.across)))
     growth = 1 + float(numbers[MAGNIFICATION])
-    middle, width = sub.type.middle(sub.window), float(sub.type.footprint) / growth
-    starts = [
-        centre + offset / growth + move - width / 2
-        for centre, offset, move in zip(middle, (down, across), (rows, columns), strict=True)
+    widths = [float(side) / growth for side in sub.type.footprint]
+    return [
+        (centre + offset / growth + move - width / 2, width)
+        for centre, offset, move, width in zip(
+            sub.type.middle(sub.window), (down, across), (rows, columns), widths, strict=True
+        )
     ]
-    return starts, width
 
 
 def _overlap(start: FloatArray, width: float, first: IntArray, size: int) -> FloatArray:
@@ -126,11 +128,12 @@ def _expected(
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the light and the centroids of the chart's pixels, (pixels,) each, also outside the chart's windows."""
     if has_boxes(sub, numbers):
-        starts, width = _intervals(camera, sub, numbers, chart)
-        pairs = zip(starts, camera.shape, strict=True)
-        ends = [(np.maximum(start, 0), np.minimum(start + width, size)) for start, size in pairs]
-        down, across = (np.maximum(last - first, 0) / width for first, last in ends)
-        return down * across, [(first + last) / 2 for first, last in ends]
+        shares, middles = list[FloatArray](), list[FloatArray]()
+        for (start, width), size in zip(_intervals(camera, sub, numbers, chart), camera.shape, strict=True):
+            first, last = np.maximum(start, 0), np.minimum(start + width, size)
+            shares.append(np.maximum(last - first, 0) / width)
+            middles.append((first + last) / 2)
+        return shares[0] * shares[1], middles
     rows = _rows(camera, sub, numbers, chart)
     light = rows @ np.ones(camera.unknowns)
     places = np.divmod(np.arange(camera.unknowns), camera.columns)
@@ -275,10 +278,10 @@ def _centroids(
     matched : True takes the moves that explain a row's entries best, which noise far from its light does not disturb
     """
     light, expected = _expected(camera, sub, numbers, chart)
-    boxes, (starts, width) = _designed_boxes(sub), _intervals(camera, sub, numbers, chart)
+    boxes, intervals = _designed_boxes(sub), _intervals(camera, sub, numbers, chart)
     least = LEAST_LIGHT if boxes else 1 - LOST
     kept, slopes = (light > least) & (chart.light > least), np.ones((2, light.size))
-    for slope, start, size in zip(slopes, starts, camera.shape, strict=True):
+    for slope, (start, width), size in zip(slopes, intervals, camera.shape, strict=True):
         for beyond in (-start, start + width - size) if boxes else ():
             slope[beyond > 0] -= 0.0 if matched else 0.5  # of a box that the edge cuts the other end alone moves
             kept &= np.abs(beyond) > NEAR

@@ -45,7 +45,6 @@ from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint, State
 from .sampling.passes import (
     AVERAGED,
-    FEWEST_PASSES,
     MOST_SAMPLES,
     Plan,
     Tally,
@@ -57,7 +56,7 @@ from .sampling.passes import (
     rounding_variance,
     samples_within,
 )
-from .sampling.samplers import LEAPS, expected_exponent, measured_exponent, next_samples
+from .sampling.sample_law import LEAPS, SampleLaw
 from .world_view import rendered_world
 
 DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, and what a round is planned for
@@ -179,14 +178,14 @@ class AdaptiveRounds:
         self._slices = setup.camera.slices()
         self.mean, self.variance = np.zeros(setup.camera.measurements), np.zeros(setup.camera.measurements)
         self._open = np.ones(setup.camera.measurements, dtype=np.bool_)  # pixels that are not done
-        exponent = expected_exponent(setup.scene.render.sampler)
+        law = SampleLaw.expected(setup.scene.render.sampler)
         self._world, flat, sampler = setup.world.simulated, setup.scene.world is None, setup.scene.render.sampler
         exact = (exact_plan(self._world, index, sampler, fast=renderer.is_fast) for index in range(len(self._slices)))
         self._exact = [plan if flat else None for plan in exact]
         quasi_random = flat and renderer.is_fast and sampler == "multijitter"
         self._sobol = [quasi_random and sub.type.optics.has_width for sub in self._world.sub_imagers]
         plans = [self._first(index) if plan is None else plan for index, plan in enumerate(self._exact)]
-        self.sub_imagers = [SubImagerProgress(work, exponent) for work in plans]
+        self.sub_imagers = [SubImagerProgress(work, law) for work in plans]
 
     @property
     def unfinished(self) -> list[int]:
@@ -211,7 +210,7 @@ class AdaptiveRounds:
             rows, sub = self._slices[index], self.sub_imagers[index]
             allowed = mean_of_known(self._allowed(self.mean[rows], rows))
             factor = mean_of_known(self.variance[rows]) / allowed if allowed else 0.0
-            most = max(most, sub.predicted_samples(max(factor, AIM), MOST_SAMPLES))
+            most = max(most, sub.law.samples(max(factor, AIM), sub.last, MOST_SAMPLES))
         return most, float(most) * self.mean.size
 
     @property
@@ -318,7 +317,7 @@ class AdaptiveRounds:
         float64 = self._renderer.float32_samples(2) == 1
         most = MOST_EXACT if float64 else min(samples_within(values, AIM * target), MOST_SAMPLES)
         factors = np.quantile(variance / (AIM * target), QUANTILES)
-        totals = [sub.predicted_samples(float(factor), most) for factor in factors]
+        totals = [sub.law.samples(float(factor), sub.last, most) for factor in factors]
         sub.left = float(np.mean(totals)) * values.size
         sub.next = self._grid(index, min(totals[-1], LEAP * sub.last.total, MOST), most)
         if sub.next.total < LEAPS[0] * sub.last.total or sub.seeds + sub.next.passes > MOST_PASSES:
@@ -398,12 +397,12 @@ class SubImagerProgress:
     left : rays of all rounds to come, as predicted
     spent : samples of all rounds per pixel that was in each of them;  fewest : the same for the first pixel to be done
     rays : of all rounds;  seeds : number of passes so far
-    scatter : variance of one pass of the last round, mean over the unfinished pixels
-    exponent : of its fall with the samples of a pass;  ended : why the sub-imager ended, "" before that
+    scatter : variance of one pass of the last round, mean over the unfinished pixels;  law : of its fall
+    ended : why the sub-imager ended, "" before that
     """
 
     next: Plan
-    exponent: float
+    law: SampleLaw
     last: Plan = field(default_factory=lambda: Plan(0, 0))
     left: float = 0.0
     rounds: int = 0
@@ -417,28 +416,21 @@ class SubImagerProgress:
     @staticmethod
     def from_json(values: dict[str, Any]) -> SubImagerProgress:
         """Create the progress from its fields in JSON's types."""
-        fields: dict[str, Any] = {**values, **{name: Plan(**values[name]) for name in ("next", "last")}}
+        plans = {name: Plan(**values[name]) for name in ("next", "last")}
+        fields: dict[str, Any] = {**values, **plans, "law": SampleLaw(**values["law"])}
         return SubImagerProgress(**fields)
 
     def add_round(self, work: Plan, variance: FloatArray) -> None:
         """Account for a round, from its plan and the variances of its pixels' means."""
         scatter = mean_of_known(variance) * work.passes
         if self.scatter > 0 and scatter > 0 and work.samples > self.last.samples:
-            self.exponent = measured_exponent(self.scatter / scatter, work.samples / self.last.samples)
+            self.law = SampleLaw.measured(self.scatter / scatter, work.samples / self.last.samples)
         self.last, self.rounds = work, self.rounds + 1
         self.spent, self.seeds, self.rays = (
             self.spent + work.total,
             self.seeds + work.passes,
             self.rays + work.total * variance.size,
         )
-
-    def predicted_samples(self, factor: float, most: int) -> int:
-        """Predict the samples per pixel that divide the variance by `factor`, in passes of at most `most`."""
-        each = self.last.samples * (factor * self.last.passes / FEWEST_PASSES) ** (1 / self.exponent)
-        total = FEWEST_PASSES * each
-        if each > most:
-            total = most * self.last.passes * factor * (self.last.samples / most) ** self.exponent
-        return next_samples(total, self.last.total)
 
 
 def mean_of_known(variance: FloatArray) -> float:

@@ -28,7 +28,6 @@ from ommatid.simulate.adaptive_render import (
     SHARE,
     TIME,
     AdaptiveRendering,
-    SubImagerProgress,
     render_until,
 )
 from ommatid.simulate.calibrate import cached_model, calibrate
@@ -36,6 +35,7 @@ from ommatid.simulate.calibration.adaptive_rounds import GOAL, StoppingRule
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import cached_stack, render
 from ommatid.simulate.sampling.passes import EXACT_PASSES, Plan, cells_of, on_grid, rounding_variance, samples_within
+from ommatid.simulate.sampling.sample_law import SampleLaw
 
 from ..conftest import Command
 from ..examples import GALLERY, SLOW_SCALAR, THREE, VARIANTS, needs, scene
@@ -205,14 +205,16 @@ def test_an_interrupted_rendering_continues(tmp_path: Path) -> None:
 
 
 def test_predicted_samples_divide_the_variance_by_the_factor() -> None:
+    last = Plan(16, 64)
     for exponent in (1.0, 1.5, 2.0):
-        progress = SubImagerProgress(Plan(16, 16), exponent, last=Plan(16, 64))
+        law = SampleLaw(exponent)
         for factor, most in ((10.0, 10**6), (1e4, 512)):
-            total = progress.predicted_samples(factor, most)
+            total = law.samples(factor, last, most)
             each = min(total / 16, most)
             ratio = (each / 64) ** exponent * total / (16 * each)
-            bound = max(progress.last.total * 2, min(total, progress.last.total * 64))
+            bound = max(last.total * 2, min(total, last.total * 64))
             assert ratio == pytest.approx(factor, rel=0.01) or total == bound
+        assert law.ratio(last, Plan(32, 256)) == pytest.approx(1 / (2 * 4**exponent), rel=1e-12)
 
 
 def test_grids_fit_and_rounding_inverts() -> None:

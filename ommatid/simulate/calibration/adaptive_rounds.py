@@ -22,8 +22,8 @@ from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint
-from ..sampling.passes import MOST_SAMPLES, cells_of, on_grid
-from ..sampling.samplers import expected_exponent, measured_exponent, next_samples
+from ..sampling.passes import FEWEST_PASSES, MOST_SAMPLES, Plan, cells_of, on_grid
+from ..sampling.sample_law import SampleLaw
 from .entries import rendered_model
 from .point_sources import Plans
 
@@ -66,7 +66,7 @@ def calibrate_until(
     state = {} if checkpoint is None else checkpoint.state()
     tried: list[dict[str, Any]] = json.loads(str(state["tried"])) if "tried" in state else []
     while True:
-        samples = _next(tried, expected_exponent(scene.render.sampler), most)
+        samples = _next(tried, SampleLaw.expected(scene.render.sampler), most)
         plans = plans_of(setup, samples, float64)
         model = rendered_model(
             replace(setup, scene=_with_samples(scene, samples)), progress, plans=plans, float64=float64
@@ -96,15 +96,15 @@ def plans_of(setup: Setup, samples: int, float64: bool) -> Plans:
     return {lens_type.name: on_grid(samples, sampler, cells_of(lens_type), most) for lens_type in setup.camera.types}
 
 
-def _next(tried: list[dict[str, Any]], exponent: float, most: int) -> int:
+def _next(tried: list[dict[str, Any]], law: SampleLaw, most: int) -> int:
     """Return the samples of the next round."""
     if not tried:
         return LEAST
     asked, adds = tried[-1]["asked"], tried[-1]["adds"]
     if len(tried) > 1:
         before = tried[-2]
-        exponent = measured_exponent(before["adds"] / adds, asked / before["asked"])
-    return min(next_samples(asked * (adds / AIM) ** (1 / exponent), asked), most)
+        law = SampleLaw.measured(before["adds"] / adds, asked / before["asked"])
+    return min(law.samples(adds / AIM, Plan(FEWEST_PASSES, asked // FEWEST_PASSES), MOST_EXACT), most)
 
 
 def _is_flat(tried: list[dict[str, Any]]) -> bool:

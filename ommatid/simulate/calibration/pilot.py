@@ -27,7 +27,8 @@ from ommatid.scenes.shrinkage import shrink_variances
 from ..render import light
 from ..renderer.variant import choose, unusable_reason
 from ..sampling.passes import BATCHES, Plan, plan
-from ..sampling.samplers import expected_exponent, fitting
+from ..sampling.sample_law import SampleLaw
+from ..sampling.samplers import fitting
 from .adaptive_rounds import LEAST, plans_of
 from .entries import rendered_model
 from .point_sources import Plans, same_plans
@@ -150,8 +151,8 @@ def pilot(setup: Setup, plans: Plans) -> Pilot:
     changed = setup_of_pilot(setup, samples=max(work.total for work in traced.values()), fit="none")
     model = rendered_model(changed, plans=traced, float64=scene.calibration.samples == "auto")
     pinholes = all(lens.optics.aperture is None and lens.optics.surfaces is None for lens in setup.simulated.types)
-    exponent = expected_exponent(scene.render.sampler) if pinholes else 1.0
-    return Pilot(model, *_factor(setup.camera, traced, plans, exponent))
+    law = SampleLaw.expected(scene.render.sampler) if pinholes else SampleLaw()
+    return Pilot(model, *_factor(setup.camera, traced, plans, law))
 
 
 def world_variance(setup: Setup, plans: Plans) -> tuple[FloatArray, bool]:
@@ -165,16 +166,15 @@ def world_variance(setup: Setup, plans: Plans) -> tuple[FloatArray, bool]:
     changed = setup_of_pilot(setup)
     render = changed.scene.render.model_copy(update={"samples": few.total})
     rendering = light(replace(changed, scene=with_tables(changed.scene, render=render)), work=few)
-    factor, extrapolated = _factor(setup.camera, dict.fromkeys(plans, few), plans, 1.0)
+    factor, extrapolated = _factor(setup.camera, dict.fromkeys(plans, few), plans, SampleLaw())
     return factor * rendering.stated_variance(setup.camera), extrapolated
 
 
-def _factor(camera: Camera, traced: Plans, plans: Plans, exponent: float) -> tuple[FloatArray, bool]:
+def _factor(camera: Camera, traced: Plans, plans: Plans, law: SampleLaw) -> tuple[FloatArray, bool]:
     """Return the variances with the samples of `plans` over those of `traced`, (M,), and True if samples differ."""
     rows = np.empty(camera.measurements)
     for lens_type, pixels in zip(camera.types, camera.type_slices(), strict=True):
-        few, all_ = traced[lens_type.name], plans[lens_type.name]
-        rows[pixels] = few.passes / all_.passes * (few.samples / all_.samples) ** exponent
+        rows[pixels] = law.ratio(traced[lens_type.name], plans[lens_type.name])
     return rows, any(traced[name].samples < work.samples for name, work in plans.items())
 
 

@@ -7,15 +7,12 @@ the recorded number is the one that was used.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, inf, isqrt, log
+from math import inf, isqrt, log
 
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.tables.estimation import Sampler
 
 RELATED_DRAWS: tuple[Sampler, ...] = ("stratified", "ldsampler")  # successive draws of a ray are far from independent
-STRATIFIED, INDEPENDENT = 1.5, 1.0  # exponents of the fall of a variance with samples, before it is measured
-STEEPEST = 2.0  # largest exponent that a measurement is trusted with
-LEAPS = (2.0, 64.0)  # least and largest growth of the samples from one round to the next
 IN_THE_LIMIT = 64  # samples in a pass: with fewer, strata that hold a corner are not few beside those along an edge
 
 
@@ -50,21 +47,6 @@ def filling(sampler: Sampler, most: int) -> int:
     return next(
         (samples for samples in range(most, 0, -1) if fitting(sampler, samples) == samples), fitting(sampler, 1)
     )
-
-
-def expected_exponent(sampler: Sampler) -> float:
-    """Return the exponent with which a variance falls with the samples of a pass through pinholes."""
-    return INDEPENDENT if sampler == "independent" else STRATIFIED
-
-
-def measured_exponent(fall: float, growth: float) -> float:
-    """Return the exponent of a variance that fell by a factor while the samples grew by another, within limits."""
-    return min(max(log(fall) / log(growth), INDEPENDENT), STEEPEST)
-
-
-def next_samples(wanted: float, last: float) -> int:
-    """Return the samples of a round after one of `last`: as many as are wanted, within the limits of growth."""
-    return ceil(min(max(wanted, LEAPS[0] * last), LEAPS[1] * last))
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ def assert_model_is(found: Model, truth: sparse.csr_array, known: Array | slice 
     assert np.mean(z**2) == pytest.approx(1, abs=5 * (3 / z.size) ** 0.5)
 
 
-@pytest.mark.parametrize("times", [1, 2, 5])
+@pytest.mark.parametrize("times", [1, 2, pytest.param(5, marks=pytest.mark.slow)])
 def test_swept_points_give_h_within_its_variance(imaging_camera: Camera, ommatid: Command, times: int) -> None:
     """With one sweep only the background shows noise, not that of photons; so that case has no photon noise."""
     rng = np.random.default_rng(times)
@@ -142,7 +142,7 @@ def test_several_points_can_be_lit_at_once(imaging_camera: Camera, ommatid: Comm
         imaging_camera, truth, positions, "b", 6
     )
     write_positions("p.csv", [*positions, *positions], names)
-    ended = ommatid("calibrate", "scene.toml", "--points", *names, "--places", "p.csv", "-o", "h.npz")
+    ended = ommatid("calibrate", "scene.toml", "--points", *names, "--places", "p.csv", "-o", "h.npz", *ENTRIES)
     assert ended.code == 0, ended.err
     assert_model_is(model_file.read(Path("h.npz")), truth)
 
@@ -183,15 +183,25 @@ def turned(camera: Camera) -> sparse.csr_array:
     return sparse.csr_array(sparse.vstack(parts, format="csr"))
 
 
-@pytest.mark.parametrize(("part", "seeds"), [("1", 2), ("2/3", 2), pytest.param("1", 20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("part", "array", "seeds"),
+    [
+        ("1", 2, 2),
+        ("2/3", 2, 2),
+        pytest.param("2/3", 3, 2, marks=pytest.mark.slow),
+        pytest.param("1", 3, 20, marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.usefixtures("imaging_camera")
-def test_views_replace_the_entries_of_a_rotated_sensor(ommatid: Command, part: str, seeds: int) -> None:
+def test_views_replace_the_entries_of_a_rotated_sensor(ommatid: Command, part: str, array: int, seeds: int) -> None:
     """Readings of a picture err by no more than stated, on average, and far less than with entries.
 
     part : side of the open part of the pixels over their pitch
+    array : rows and columns of the second lens type
     """
     scene = Path("scene.toml")
-    scene.write_text(scene.read_text("utf-8").replace("[camera]", f'[camera]\nfill_factor = "{part}"', 1), "utf-8")
+    text = scene.read_text("utf-8").replace("[camera]", f'[camera]\nfill_factor = "{part}"', 1)
+    scene.write_text(text.replace("array = [3, 3]", f"array = [{array}, {array}]"), "utf-8")
     camera = derive(read(scene))
     truth, image = turned(camera), np.random.default_rng(0).uniform(0, 255, camera.unknowns)
     refused = 0
@@ -259,7 +269,7 @@ def test_points_that_leave_a_pixel_dark_are_dark_frames_of_it(imaging_camera: Ca
     truth, rng = blurred_matrix(imaging_camera), np.random.default_rng(5)
     np.save("points.npy", 40 + sweep(imaging_camera, truth, 2, rng))
     dark = save(Path("dark.npy"), as_mosaic(imaging_camera, rng.normal(40, READ, imaging_camera.measurements)))
-    ended = ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz", "--dark", dark)
+    ended = ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz", "--dark", dark, *ENTRIES)
     assert ended.code == 0, ended.err
     found, image = model_file.read(Path("h.npz")), np.full(imaging_camera.unknowns, 255.0)
     counted = found.variance_from_model(image)
@@ -272,7 +282,7 @@ def test_stray_light_of_several_points_gives_a_warning(imaging_camera: Camera, o
     positions = [np.array([(row, column), (row, column + 7)]) for row in range(12) for column in range(7)]
     names = record_grids(imaging_camera, with_ghost(imaging_camera), positions, "a", 5)
     write_positions("p.csv", positions, names)
-    ended = ommatid("calibrate", "scene.toml", "--points", *names, "--places", "p.csv", "-o", "h.npz")
+    ended = ommatid("calibrate", "scene.toml", "--points", *names, "--places", "p.csv", "-o", "h.npz", *ENTRIES)
     assert ended.code == 0, ended.err
     assert "1 readings beyond the footprints" in ended.err
 

@@ -32,11 +32,11 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def write_film(folder: Path, shape: tuple[int, int], count: int) -> None:
-    scene = wide(shape, noise={"variance": 1e-2}, estimator={"method": "frame"}, calibration={"method": "ideal"})
+    scene = wide(shape, noise={"variance": 1.0}, estimator={"method": "frame"}, calibration={"method": "ideal"})
     model_file.write(folder / "model.npz", ideal_model(scene, derive(scene)))
     for number in range(count):
         image = 127.5 + np.random.default_rng(number).normal(0, P0**0.5, shape[0] * shape[1])
-        stack_file.write(folder / f"f{number}.exr", recorded(scene, image, 1e-2, number))
+        stack_file.write(folder / f"f{number}.exr", recorded(scene, image, 1.0, number))
 
 
 def stacks(film: Path) -> list[Path]:
@@ -58,7 +58,7 @@ def test_the_results_are_those_of_single_runs(film: Path, tmp_path: Path, ommati
     assert ended.code == 0, ended.err
     documents = json.loads(ended.out)
     assert [document["stack"] for document in documents] == [str(stack) for stack in stacks(film)]
-    for stack, document in zip(stacks(film), documents, strict=True):
+    for stack, document in [*zip(stacks(film), documents, strict=True)][:: COUNT - 1]:
         single = ommatid("reconstruct", stack, model, "-o", tmp_path / "one.exr", *options, "--json")
         assert without_times(document) == without_times(json.loads(single.out))
         assert_same(Path(document["file"]), tmp_path / "one.exr")

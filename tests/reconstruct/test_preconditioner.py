@@ -24,7 +24,13 @@ ODD: Lenses = (("2/7", [4, 4], "fit"), ("1/4", [3, 4], "fit"), ("1/3", [3, 3], "
 RATIOS: Lenses = (("2/7", [4, 4], "fit"), ("3/8", [3, 3], "fit"), ("1/4", [4, 4], "fit"))
 
 
-@pytest.mark.parametrize("camera", [frame_camera((36, 31)), diffracting((33, 36))], ids=["boxes", "kernels"])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        pytest.param(frame_camera((36, 31)), id="boxes"),
+        pytest.param(diffracting((33, 36)), id="kernels", marks=pytest.mark.slow),
+    ],
+)
 def test_it_is_symmetric_and_nearly_the_inverse(camera: Camera) -> None:
     """Eigenvalues of P K are within a sixth of 1 but for a few, at corners that some lens types do not see."""
     preconditioner = frame_system(camera, np.full(camera.measurements, 100.0)).preconditioner
@@ -51,20 +57,20 @@ def steps(camera: Camera, noise: float | FloatArray, prior: float | FloatArray =
     return system.solve(system.right_hand_side(readings + rng.normal(size=readings.size) / np.sqrt(weights))).steps
 
 
-def test_steps_with_a_cheaper_h_solve_for_the_exact_one() -> None:
+@pytest.mark.parametrize("noise", [1e-3, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_steps_with_a_cheaper_h_solve_for_the_exact_one(noise: float) -> None:
     """Fewer than without them, as accurate by the bound, and where noise is so small that what H leaves out matters."""
     exact = Observation(CAMERA.shape, tuple(smooth_kernels(index) for index in range(len(CAMERA.types))))
     image = np.random.default_rng(2).normal(0, P0**0.5, CAMERA.unknowns)
-    for noise in (1.0, 1e-3):
-        weights = np.full(CAMERA.measurements, 1 / noise)
-        system = frame_system(CAMERA, weights, observation=exact)
-        dense = precision(exact.to_sparse(), weights, 1 / P0)
-        nested = replace(system, similar=Refined.of(system, system.preconditioner))
-        solution, plain = (each.solve(dense @ image) for each in (nested, system))
-        assert isinstance(nested.similar, Refined)
-        assert solution.steps < 0.7 * plain.steps
-        deviations = np.sqrt(np.diagonal(np.linalg.inv(dense)))
-        assert np.abs((solution.image - image) / deviations).max() <= solution.bound <= ACCURACY
+    weights = np.full(CAMERA.measurements, 1 / noise)
+    system = frame_system(CAMERA, weights, observation=exact)
+    dense = precision(exact.to_sparse(), weights, 1 / P0)
+    nested = replace(system, similar=Refined.of(system, system.preconditioner))
+    solution, plain = (each.solve(dense @ image) for each in (nested, system))
+    assert isinstance(nested.similar, Refined)
+    assert solution.steps < 0.7 * plain.steps
+    deviations = np.sqrt(np.diagonal(np.linalg.inv(dense)))
+    assert np.abs((solution.image - image) / deviations).max() <= solution.bound <= ACCURACY
     designed = frame_system(CAMERA, np.full(CAMERA.measurements, 1.0))
     assert Refined.of(designed, designed.preconditioner) is designed.preconditioner
 

@@ -27,9 +27,17 @@ MADE = ("stack.exr", "model.npz", "estimate.exr", "run.json", "report.html")
 FEW = ("render.samples=16", "calibration.samples=16", "render.variant=scalar_rgb", "noise.variance=1e-2")
 
 
+@pytest.fixture(
+    scope="module", params=["none", pytest.param("auto", marks=pytest.mark.slow)], ids=["entries", "few numbers"]
+)
+def changes(request: pytest.FixtureRequest) -> list[str]:
+    """Changes of the scene; the fit of H by few numbers takes most of the time."""
+    return [*FEW, f"calibration.fit={request.param}"]
+
+
 @pytest.fixture(scope="module")
-def scene() -> ommatid.Scene:
-    return ommatid.read_scene("tile19", set=FEW)
+def scene(changes: list[str]) -> ommatid.Scene:
+    return ommatid.read_scene("tile19", set=changes)
 
 
 @pytest.fixture(scope="module")
@@ -89,11 +97,16 @@ def test_reconstruct_is_a_function_and_stays_a_package() -> None:
 
 
 def test_it_yields_the_numbers_of_the_commands(
-    stack: ommatid.Stack, model: ommatid.Model, result: ommatid.Result, tmp_path: Path, ommatid_command: Command
+    changes: list[str],
+    stack: ommatid.Stack,
+    model: ommatid.Model,
+    result: ommatid.Result,
+    tmp_path: Path,
+    ommatid_command: Command,
 ) -> None:
     """Bit for bit: the files of `ommatid run`, read again, and the estimate as that stores it."""
-    changes = [word for change in FEW for word in ("--set", change)]
-    assert ommatid_command("run", "tile19", "-o", tmp_path, *changes).code == 0
+    options = [word for change in changes for word in ("--set", change)]
+    assert ommatid_command("run", "tile19", "-o", tmp_path, *options).code == 0
     folder = tmp_path / "tile19"
     there = ommatid.read_stack(folder / "stack.exr"), ommatid.read_model(folder / "model.npz")
     np.testing.assert_array_equal(there[0].values, stack.values)
@@ -115,7 +128,7 @@ def test_it_yields_the_numbers_of_the_commands(
 
 @pytest.mark.slow
 def test_a_prepared_model_gives_the_same_results(
-    scene: ommatid.Scene, stack: ommatid.Stack, model: ommatid.Model, result: ommatid.Result
+    changes: list[str], scene: ommatid.Scene, stack: ommatid.Stack, model: ommatid.Model, result: ommatid.Result
 ) -> None:
     reconstructor = ommatid.prepare(model, scene)
     for _ in range(2):
@@ -125,7 +138,7 @@ def test_a_prepared_model_gives_the_same_results(
         np.testing.assert_array_equal(again.truth, result.truth)
         assert (again.summary.error, again.summary.verdict) == (result.summary.error, result.summary.verdict)
         assert again.reconstruction is not None
-    other = ommatid.prepare(model, ommatid.read_scene("tile19", set=[*FEW, "prior.variance=1000"]))(stack)
+    other = ommatid.prepare(model, ommatid.read_scene("tile19", set=[*changes, "prior.variance=1000"]))(stack)
     changed = stack.scene.model_copy(update={"prior": scene.prior.model_copy(update={"variance": 1000.0})})
     alone = ommatid.reconstruct(replace(stack, scene=changed), model)
     np.testing.assert_array_equal(other.image, alone.image)

@@ -50,7 +50,7 @@ PRIORS = {
 }
 
 
-@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize("name", [pytest.param("independent", marks=pytest.mark.slow), "exponential"])
 def test_all_parameters_are_fitted_better_than_the_tolerance_knows_them(name: str) -> None:
     """Fitted numbers and the estimate with them are nearer to the truth than the design is, though H has kinks."""
     camera, rng, prior = misaligned_camera(tolerance=TOLERANCES), np.random.default_rng(0), PRIORS[name]

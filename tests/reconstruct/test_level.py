@@ -96,14 +96,15 @@ def replace_tables(scene: Scene, **tables: dict[str, Any]) -> Scene:
     return scene.model_copy(update=changed)
 
 
-def test_means_of_regions_of_dark_pictures_deviate_by_what_is_stated() -> None:
+@pytest.mark.parametrize("pictures", [4, pytest.param(20, marks=pytest.mark.slow)])
+def test_means_of_regions_of_dark_pictures_deviate_by_what_is_stated(pictures: int) -> None:
     """With a known level the whole is three of its deviations too bright."""
     found: list[list[float]] = []
     for level in ("known", LEVEL):
         scene = described(ONE, "frame", level=level)
         stack = recorded(scene, dark(2), NOISE)
         model, ratios = ideal_model(scene, stack.camera), []
-        for seed in range(20):
+        for seed in range(pictures):
             picture = dark(seed)
             result = restore(replace(stack, values=recorded(scene, picture, NOISE, seed).values), model)
             mean, deviation = result.region((0, 0), (SIDE, SIDE))

@@ -128,7 +128,10 @@ def check_imports(code: ast.Module) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)
 def test_code_blocks_of_a_page_are_read(page: Path, tmp_path: Path, ommatid: Command) -> None:
-    """The short form: commands are parsed, Python is compiled, scenes are read, and closed forms of cameras as designed are computed."""
+    """The short form: commands are parsed, Python is compiled, scenes are read, and closed forms are computed.
+
+    The closed forms are of cameras as designed: those with a tolerance take longer.
+    """
     shutil.copytree(GALLERY, tmp_path / "scenes", ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     for block in blocks(page):
         if block.file_name is not None:

@@ -224,9 +224,7 @@ def test_sums_and_intervals_are_those_of_the_dense_problem_where_error_bars_are_
     assert frame.interval.variance == pytest.approx(dense.interval.variance, rel=0.35)  # of one random image
 
 
-@pytest.mark.parametrize(
-    ("shape", "noise"), [((19, 17), 1.0), pytest.param((33, 31), 1e-2, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("shape", "noise"), [((19, 17), 1.0), pytest.param((33, 31), 1e-2, marks=pytest.mark.slow)])
 def test_lenses_that_diffract(shape: tuple[int, int], noise: float) -> None:
     """Kernels wider than the frame, by the dense problem: the image, error bars at every pixel, and the interval."""
     scene, truth = with_apertures(wide(shape, noise={"variance": noise})), drawn(shape, 1)
@@ -273,9 +271,7 @@ def varying_blur(shape: tuple[int, int], noise: float) -> tuple[Scene, Model]:
     return described, fitted_model(described, camera, fitted, None, {"method": "transport", "versions": {}})
 
 
-@pytest.mark.parametrize(
-    ("shape", "noise"), [((19, 17), 1.0), pytest.param((33, 31), 1e-2, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("shape", "noise"), [((19, 17), 1.0), pytest.param((33, 31), 1e-2, marks=pytest.mark.slow)])
 def test_kernels_that_hardly_vary_count_in_error_bars(shape: tuple[int, int], noise: float) -> None:
     """Interval, regions and expected residual of blur that varies by less than 1 %: by the dense covariance.
 

@@ -39,8 +39,8 @@ def task_of(scene: Scene, truth: FloatArray, seed: int = 0) -> EstimationTask:
 def test_tiles_of_a_frame_that_conjugate_gradients_do_not_solve_state_no_expectation_for_their_estimate(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    scene = wide((70, 66), noise={"variance": NOISE}, estimator={"method": "tiles"})
-    stack = recorded(scene, drawn((70, 66)), NOISE)
+    scene = wide((50, 46), noise={"variance": NOISE}, estimator={"method": "tiles"})
+    stack = recorded(scene, drawn((50, 46)), NOISE)
     found = restore(stack, ideal_model(scene, stack.camera))
     assert found.solver.method.startswith("tiles")
     given = found.given_estimate()
@@ -150,8 +150,8 @@ def test_threads_and_processes_give_identical_results() -> None:
 
 
 def test_dead_pixels_are_skipped() -> None:
-    scene = wide((50, 47), tiles={"size": 30, "overlap": 6})
-    truth = drawn((50, 47))
+    scene = wide((34, 31), tiles={"size": 20, "overlap": 6})
+    truth = drawn((34, 31))
     task = task_of(scene, truth)
     used = np.random.default_rng(0).uniform(size=task.used.size) > 0.02
     recorded_values = np.where(used, task.recorded, np.nan)

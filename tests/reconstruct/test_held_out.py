@@ -206,14 +206,12 @@ def test_what_is_right_is_trusted_on_a_photograph(name: str) -> None:
     assert check.p_value > 1e-4
 
 
-@pytest.mark.parametrize(
-    ("noise", "draws"), [(1.0, 12), *(pytest.param(noise, 20, marks=pytest.mark.slow) for noise in (1.0, 100.0))]
-)
-def test_pictures_of_any_level_are_predicted_as_well_as_stated(noise: float, draws: int) -> None:
-    """Draws of the prior with levels, and a dark and a bright picture by a fitted prior."""
+@pytest.mark.parametrize("noise", [1.0, pytest.param(100.0, marks=pytest.mark.slow)])
+def test_pictures_of_any_level_are_predicted_as_well_as_stated(noise: float) -> None:
+    """Twenty draws of the prior with levels, and a dark and a bright picture by a fitted prior."""
     described = scene(lenses=PAIR, noise={"variance": noise}, prior={"kind": "independent", "variance": 200.0})
     camera, total, freedoms = derive(described), 0.0, 0.0
-    for seed in range(draws):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         drawn_image = rng.normal(127.5, 64.0) + rng.normal(0.0, 200.0**0.5, camera.unknowns)
         check = checked(described, ideal_matrix(camera), drawn_image, seed=seed)

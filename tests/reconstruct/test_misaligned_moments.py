@@ -77,7 +77,7 @@ def test_tables_hold_the_drawn_misalignments() -> None:
 @pytest.mark.parametrize(
     ("name", "tolerance", "draws"),
     [
-        pytest.param("independent", POSITION, 100, id="0.03 pixels, few"),
+        pytest.param("independent", POSITION, 50, id="0.03 pixels, few"),
         pytest.param("independent", POSITION, 300, id="0.03 pixels", marks=pytest.mark.slow),
         pytest.param("exponential", {"position": "600 nm"}, 300, id="0.4 pixels", marks=pytest.mark.slow),
         pytest.param("exponential", TOLERANCES, 300, id="all", marks=pytest.mark.slow),

@@ -236,7 +236,9 @@ def test_negative_variances_are_refused(kept: Path, ommatid: Command) -> None:
 
 
 def test_without_noise_there_is_no_chi_squared() -> None:
-    stack, model, truth = recorded(scene(lenses=THREE, noise={"variance": 0.0}, estimator={"noise_variance": 0.0}))
+    pixel_by_pixel = (1, [1, 1], [12, 12]), ("1/3", [3, 3], [3, 3])
+    noiseless: dict[str, Any] = {"noise": {"variance": 0.0}, "estimator": {"noise_variance": 0.0}}
+    stack, model, truth = recorded(scene((12, 12), pixel_by_pixel, **noiseless))
     restoration = restore(stack, model, truth)
     assert restoration.residual is None
     assert "chi-squared of the residual" not in rows(restoration, stack, model)

@@ -67,10 +67,13 @@ def test_sub_images_of_a_photograph(variant: str, sampler: Sampler) -> None:
     assert_student(rendering.mean - ideal(setup), variance_of(rendering), rendering.passes)
 
 
-@pytest.mark.parametrize("variant", SLOW_SCALAR)
-def test_calibrated_h(variant: str) -> None:
+@pytest.mark.parametrize(
+    ("variant", "samples"),
+    [("llvm_ad_mono", 1024), *(pytest.param(each, 4096, marks=pytest.mark.slow) for each in VARIANTS)],
+)
+def test_calibrated_h(variant: str, samples: int) -> None:
     needs(variant)
-    setup = three_types(variant, 4096)
+    setup = three_types(variant, samples)
     responses = responses_from_points(setup)
     matrix, exact = responses.matrix, ideal_matrix(setup.camera).toarray()
     dense = matrix.toarray()

@@ -19,7 +19,7 @@ from .hostile_worlds import FAMILIES, hostile_world, mesh, scene
 
 WHERE = "test.toml: world.file"
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 1 2 3\n"
-EACH = 6  # worlds of each family
+EACH = 3  # worlds of each family
 
 
 def test_hostile_worlds_are_refused_in_one_short_sentence(tmp_path: Path) -> None:

@@ -38,7 +38,8 @@ ROOT = Path(__file__).parents[2]
 SHAPE = (52, 47)
 SMALL = (38, 35)  # strips along the edges cover it entirely
 NOISE = {"variance": 1e-2, "bits": 10}
-VARIANCE = 1e-2 + (256 / 2**10) ** 2 / 12
+ROUNDING = (256 / 2**10) ** 2 / 12  # variance of the steps of 10 bits
+VARIANCE = 1e-2 + ROUNDING
 SIMULATIONS = 200
 UNFITTED = (("1/3", [2, 3], "fit"),)
 ODD_RATIOS = (("2/7", [4, 4], "fit"), ("3/8", [3, 3], "fit"), ("1/4", [4, 4], "fit"))
@@ -227,9 +228,9 @@ def test_sums_and_intervals_are_those_of_the_dense_problem_where_error_bars_are_
 @pytest.mark.parametrize(("shape", "noise"), [((19, 17), 1.0), pytest.param((33, 31), 1e-2, marks=pytest.mark.slow)])
 def test_lenses_that_diffract(shape: tuple[int, int], noise: float) -> None:
     """Kernels wider than the frame, by the dense problem: the image, error bars at every pixel, and the interval."""
-    scene, truth = with_apertures(wide(shape, noise={"variance": noise})), drawn(shape, 1)
+    scene, truth = with_apertures(wide(shape, noise=NOISE | {"variance": noise})), drawn(shape, 1)
     camera = derive(scene)
-    dense, frame = both(recorded(scene, truth, noise), ideal_model(scene, camera), truth)
+    dense, frame = both(recorded(scene, truth, noise + ROUNDING), ideal_model(scene, camera), truth)
     assert np.abs(difference(frame, dense)).max() < 1e-4
     np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=1e-6)
     assert dense.interval is not None
@@ -251,7 +252,7 @@ def test_error_bars_of_two_types_of_lenses() -> None:
 
 def varying_blur(shape: tuple[int, int], noise: float) -> tuple[Scene, Model]:
     """Thin lenses which diffract, and a calibrated H whose blur varies by a part of a percent over the field."""
-    described = with_apertures(wide(shape, noise={"variance": noise}))
+    described = with_apertures(wide(shape, noise=NOISE | {"variance": noise}))
     camera = derive(described)
     kernels: dict[str, KernelFootprints] = {}
     for part in observed(camera).parts:
@@ -279,7 +280,7 @@ def test_kernels_that_hardly_vary_count_in_error_bars(shape: tuple[int, int], no
     """
     described, model = varying_blur(shape, noise)
     truth = drawn(shape, 1)
-    stack = recorded(described, truth, noise, matrix=model.as_linear_operator())
+    stack = recorded(described, truth, noise + ROUNDING, matrix=model.as_linear_operator())
     choice = replace(choose_method(described, stack.camera, exact=True), method="frame")
     found = assumptions_for(stack, model, choice, Execution()).result(truth)
     dense = restored_by("auto", stack, model, truth)

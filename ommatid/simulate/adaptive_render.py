@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby
 from math import ceil, exp, inf
@@ -50,7 +50,6 @@ from .sampling.passes import (
     Tally,
     cells_of,
     exact_plan,
-    margin,
     on_grid,
     power_of_two_plan,
     rounding_variance,
@@ -236,7 +235,7 @@ class AdaptiveRounds:
         work, seed = self.sub_imagers[indices[0]].next, self._scene.render.seed
         seeds = [sampler_seeds(seed, "data", number, MOST_PASSES) for number in range(work.passes)]
         rows = slice(self._slices[indices[0]].start, self._slices[indices[-1]].stop)
-        for part, values in expose_exactly(self._renderer, self._world, indices, work, seeds):
+        for part, values in self._renderer.expose_exactly(indices, work, seeds):
             tally = Tally(part.stop - part.start)
             for passed in values:
                 tally.add(passed)
@@ -437,29 +436,6 @@ def mean_of_known(variance: FloatArray) -> float:
     """Return the mean of the variances of pixels that receive light."""
     known = variance[np.isfinite(variance)]
     return float(known.mean()) if known.size else 0.0
-
-
-def expose_exactly(
-    renderer: Renderer, camera: Camera, indices: Sequence[int], work: Plan, seeds: Sequence[Callable[[int], int]]
-) -> Iterator[tuple[slice, FloatArray]]:
-    """Yield the readings of adjacent sub-imagers by parts: measurements, and (passes, pixels).
-
-    work : from `exact_plan`;  seeds : of each pass, by the index of a sub-imager. The values of a sub-imager depend on
-        no other one: on the fast backends all start together, on scalar they are rendered one by one.
-    """
-    slices = camera.slices()
-    if work == AVERAGED:
-        yield from renderer.expose_averages(indices)
-    elif renderer.is_fast:
-        keys = np.array([[seed(index) for seed in seeds] for index in range(len(slices))], dtype=np.int64)
-        rows = slice(slices[indices[0]].start, slices[indices[-1]].stop)
-        yield from renderer.expose_grid(rows, work, margin(camera, camera.sub_imagers[indices[0]].type), keys)
-    else:
-        for index in indices:
-            rows, columns = camera.sub_imagers[index].type.pixels
-            pixels: IntArray = np.arange(rows * columns)
-            values = renderer.expose_alone(index, pixels, work, lambda number, index=index: seeds[number](index))
-            yield slices[index], values
 
 
 def check_noise_target(scene: Scene) -> None:

@@ -11,7 +11,7 @@ import pytest
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.adaptive_render import expose_exactly, render_until
+from ommatid.simulate.adaptive_render import render_until
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import choose
@@ -64,12 +64,12 @@ def test_samples_keep_away_from_edges_by_what_float32_rounds(monkeypatch: pytest
     if variant.startswith("scalar"):
         pytest.skip("the scalar backend places its samples itself")
     setup = wide()
-    renderer, camera = Renderer(setup.simulated, variant), setup.camera
+    renderer = Renderer(setup.simulated, variant)
     renderer.set_target(setup.image)
     expected, seeds = block_means(setup), [lambda index: 10 + index, lambda index: 20 + index]
 
     def wrong() -> int:
-        ((_, values),) = expose_exactly(renderer, camera, range(4), Plan(2, 9), seeds)
+        ((_, values),) = renderer.expose_exactly(range(4), Plan(2, 9), seeds)
         return int(((values - expected) ** 2 > 16 * rounding_variance(expected, 1)).sum())
 
     assert wrong() == 0

@@ -21,6 +21,7 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.pose import PixelPlaces
 from ommatid.scenes.tables.estimation import Sampler
 
+from ..sampling.passes import Plan
 from ..sampling.samplers import RELATED_DRAWS, fitting
 from .draws import Grid, ReseededSampler, SobolDraws
 from .lens import Distance, LensModel, ThinLens
@@ -104,20 +105,18 @@ class RayGenerator:
         lanes = (block.stop - block.start) * passes * samples
         self.sampler.seed(seed, lanes)
         draws = ReseededSampler(self.sampler, seed, lanes)
-        places = self._load(block, subset)
-        ray, weight = self._emit(places, passes * samples, lanes, self.sampler.next_2d(), draws)
+        rays = self._started(block, subset, Plan(passes, samples), self.sampler.next_2d(), draws)
         if draws.has_drawn or (self._has_world and self._sampler_name in RELATED_DRAWS):
             draws.reseeded()
-        return Rays(ray, weight, samples)
+        return rays
 
     def sobol_rays(self, samples: int, seed: int, block: slice, passes: int, subset: IntArray) -> Rays:
         """Start rays as `rays` does, a power of two per pixel and pass, at Sobol's points of pixel and pupil together.
 
         Mitsuba's sampler is not ready for what the rays meet.
         """
-        lanes = (block.stop - block.start) * passes * samples
-        draws, places = SobolDraws(seed, lanes, samples), self._load(block, subset)
-        return Rays(*self._emit(places, passes * samples, lanes, draws.next_2d(), draws), samples)
+        draws = SobolDraws(seed, (block.stop - block.start) * passes * samples, samples)
+        return self._started(block, subset, Plan(passes, samples), draws.next_2d(), draws)
 
     def middle_rays(
         self, samples: int, seed: int, block: slice, passes: int, subset: IntArray
@@ -129,23 +128,22 @@ class RayGenerator:
         import drjit as dr
         import mitsuba as mi
 
-        lanes, each = (block.stop - block.start) * passes * samples, passes * samples
-        draws, places = SobolDraws(seed, lanes, samples), self._load(block, subset)
+        lanes = (block.stop - block.start) * passes * samples
         self.lens.spreads = True
-        ray = Rays(*self._emit(places, each, lanes, mi.Point2f(0.5), draws), samples)
+        draws = SobolDraws(seed, lanes, samples)
+        rays = self._started(block, subset, Plan(passes, samples), mi.Point2f(0.5), draws)
         self.lens.spreads = False
-        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, each)
-        x, y, z = (dr.gather(mi.Float, row, index) for row in places[0][:3])
+        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, passes * samples)
+        x, y, z = (dr.gather(mi.Float, row, index) for row in self._load(block, subset)[0][:3])
         x, y = x + self._pitch / 2, y + self._pitch / 2
         slope = -4 * self._pitch / (x * x + y * y + z * z)  # of cos^4
-        return ray, (self._open[0] * slope * y, self._open[1] * slope * x)
+        return rays, (self._open[0] * slope * y, self._open[1] * slope * x)
 
     def middles(self, pixels: IntArray) -> Rays:
         """Start the ray from the middle of each of some pixels of the group, of pinholes."""
         import mitsuba as mi
 
-        places = self._load(slice(0, pixels.size), pixels)
-        return Rays(*self._emit(places, 1, pixels.size, mi.Point2f(0.5), None), 1)
+        return self._started(slice(0, pixels.size), pixels, Plan(1, 1), mi.Point2f(0.5), None)
 
     def grid_rays(self, grid: Grid, passes: int, keys: IntArray, pixels: IntArray) -> Rays:
         """Start one ray per cell of a grid over each pixel and pass, of pinholes, by random numbers of each pixel.
@@ -156,16 +154,14 @@ class RayGenerator:
         import drjit as dr
         import mitsuba as mi
 
-        lanes = pixels.size * passes * grid.cells**2
-        lane = dr.arange(mi.UInt32, lanes)
-        of_pass = lane // dr.opaque(mi.UInt32, grid.cells**2)
+        work = Plan(passes, grid.cells**2)
+        lane = dr.arange(mi.UInt32, pixels.size * work.total)
+        of_pass = lane // dr.opaque(mi.UInt32, work.samples)
         numbers, own = self._places.numbers(pixels)
         key = mi.UInt32(keys[own].astype(np.uint32).ravel())
         number = dr.gather(mi.UInt32, mi.UInt32(numbers.astype(np.uint32)), of_pass // dr.opaque(mi.UInt32, passes))
         at = grid.position(lane, dr.gather(mi.UInt32, key, of_pass), number)
-        places = self._load(slice(0, pixels.size), pixels)
-        ray, weight = self._emit(places, passes * grid.cells**2, lanes, at, None)
-        return Rays(ray, weight, grid.cells**2)
+        return self._started(slice(0, pixels.size), pixels, work, at, None)
 
     def _load(self, block: slice, subset: IntArray | None) -> tuple[list[Any], Any]:
         """Load the places of the pixels of a block: coordinates and axes, and the number of each pixel's lens."""
@@ -180,13 +176,18 @@ class RayGenerator:
             self._loaded = block, coordinates, own
         return coordinates, own
 
-    def _emit(self, places: tuple[list[Any], Any], each: int, lanes: int, at: Any, draws: Any) -> tuple[Any, Any]:
-        """Return Mitsuba's rays, `each` per pixel, and their weights; at : in [0, 1)^2, points of the open parts."""
+    def _started(self, block: slice, subset: IntArray | None, work: Plan, at: Any, draws: Any) -> Rays:
+        """Return the rays of the pixels of a block.
+
+        at : points of the open parts, in [0, 1)^2;  draws : of the other random numbers
+        """
         import drjit as dr
         import mitsuba as mi
 
-        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, each)
-        corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in places[0])
+        places, own = self._load(block, subset)
+        lanes = (block.stop - block.start) * work.total
+        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, work.total)
+        corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in places)
         down, across = self._open
         at = mi.Point2f((1 - across) / 2 + across * at.x, (1 - down) / 2 + down * at.y) * self._pitch
         if axes:
@@ -198,13 +199,14 @@ class RayGenerator:
         if self._crossing is None:
             start, direction, weight = self.lens.emit(x, y, -z, draws, (lens_x, lens_y))
         else:
-            own = dr.gather(mi.UInt32, places[1], index)
-            start, direction, weight = self._crossing.emit(own, (x, y, -z), draws, (lens_x, lens_y))
+            start, direction, weight = self._crossing.emit(
+                dr.gather(mi.UInt32, own, index), (x, y, -z), draws, (lens_x, lens_y)
+            )
         ray = dr.zeros(mi.RayDifferential3f, lanes)
         origin = mi.Point3f(lens_x + start[0], lens_y + start[1], start[2] - self._height)
         ray.o, ray.d = self._placement.carry(origin, dr.normalize(mi.Vector3f(*direction)))
         ray.maxt = dr.largest(mi.Float)
-        return ray, weight
+        return Rays(ray, weight, work.samples)
 
 
 def lens_of(camera: Camera, lens_type: LensType) -> LensModel:

@@ -25,7 +25,7 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.estimation import Sampler
 
-from ..sampling.passes import Plan, has_equal_boxes, margin
+from ..sampling.passes import AVERAGED, Plan, has_equal_boxes, margin
 from ..sampling.samplers import fitting
 from .averages import Averages
 from .draws import Grid
@@ -200,37 +200,37 @@ class Renderer:
             parts.append(readings.reshape(-1, work.passes).T)
         return np.concatenate(parts, axis=1)
 
-    def expose_grid(self, rows: slice, work: Plan, margin: float, keys: IntArray) -> Iterator[tuple[slice, FloatArray]]:
-        """Yield the readings of pixels of one group, by blocks: measurements, and (passes, pixels).
+    def expose_exactly(
+        self, indices: Sequence[int], work: Plan, seeds: Sequence[Callable[[int], int]]
+    ) -> Iterator[tuple[slice, FloatArray]]:
+        """Yield the readings of adjacent sub-imagers of pinholes without error: measurements, and (passes, pixels).
 
-        work : passes with a square number of samples, in whose cells they keep a `margin` to the edges
-        keys : of each sub-imager of the camera and pass, from which the random numbers of its pixels follow. Values do
-            not depend on which others are rendered. Only on the fast backends, and for pinholes.
+        work : from `exact_plan`, by averages of the picture, or by grids in whose cells samples keep a margin to the
+            edges. Of the four averages each is displaced along an axis by what float32 may round.
+        seeds : of each pass, by the index of a sub-imager. The values of a sub-imager depend on no other one: on the
+            fast backends all start together, on scalar they are rendered one by one.
         """
-        group, first = next((name, at.start) for name in self.groups if (at := self.rows(name)).stop >= rows.stop)
-        generator = self._generators[group]
-        grid = Grid(isqrt(work.samples), margin)
-        for block in generator.blocks(work.total, rows.stop - rows.start):
-            part = slice(rows.start + block.start, rows.start + block.stop)
-            rays = generator.grid_rays(grid, work.passes, keys, np.arange(part.start - first, part.stop - first))
-            yield part, self._readings(group, rays).reshape(-1, work.passes).T
-
-    def expose_averages(self, indices: Sequence[int]) -> Iterator[tuple[slice, FloatArray]]:
-        """Yield the readings of adjacent sub-imagers of pinholes whose pixels throw equal boxes, as `expose_grid` does.
-
-        Of the four passes each is displaced along an axis by what float32 may round. Only on the fast backends.
-        """
-        subs, slices = [self.camera.sub_imagers[index] for index in indices], self.camera.slices()
-        group, lens_type = next(name for name, types in self.groups.items() if subs[0].type in types), subs[0].type
-        generator, averages = self._generators[group], self._averages_of(lens_type)
-        if averages is None:
-            raise ValueError("expected pixels that throw equal boxes on a flat picture")
+        sub, slices = self.camera.sub_imagers[indices[0]], self.camera.slices()
+        if not self._generators:
+            for index in indices:
+                pixels = np.arange(slices[index].stop - slices[index].start)
+                values = self.expose_alone(index, pixels, work, lambda number, index=index: seeds[number](index))
+                yield slices[index], values
+            return
+        group = next(name for name, types in self.groups.items() if sub.type in types)
+        generator, away = self._generators[group], margin(self.camera, sub.type)
         first, stop, start = slices[indices[0]].start, slices[indices[-1]].stop, self.rows(group).start
-        away = TYPICAL * margin(self.camera, lens_type)
-        for block in generator.blocks(1, stop - first):
+        averages = self._averages_of(sub.type) if work == AVERAGED else None
+        keys = np.array([[seed(index) for seed in seeds] for index in range(len(slices))], dtype=np.int64)
+        for block in generator.blocks(work.total if averages is None else 1, stop - first):
             part = slice(first + block.start, first + block.stop)
-            rays = generator.middles(np.arange(part.start - start, part.stop - start))
-            met = (averages.light(rays.ray, moved=by) for by in ((away, 0), (-away, 0), (0, away), (0, -away)))
+            pixels = np.arange(part.start - start, part.stop - start)
+            if averages is None:
+                rays = generator.grid_rays(Grid(isqrt(work.samples), away), work.passes, keys, pixels)
+                yield part, self._readings(group, rays).reshape(-1, work.passes).T
+                continue
+            rays, by = generator.middles(pixels), TYPICAL * away
+            met = (averages.light(rays.ray, moved=moved) for moved in ((by, 0), (-by, 0), (0, by), (0, -by)))
             yield part, np.stack([self._weighed(group, rays, light) for light in met])
 
     def blocks(self, group: str, samples: int, subset: IntArray | None = None) -> list[slice]:

@@ -44,8 +44,8 @@ def described(shape: tuple[int, int] = SHAPE, **tables: Any) -> tuple[Scene, Mod
 
 def frames(scene: Scene, count: int, rendering: float = 0.0) -> list[Stack]:
     """Stacks of different images, with rendering variances that are estimates of `rendering` from 17 passes."""
-    shape = derive(scene).shape
-    stacks = [recorded(scene, drawn(shape, seed), VARIANCE, seed) for seed in range(count)]
+    shape, variance = derive(scene).shape, VARIANCE if scene.noise is None else scene.noise.variance
+    stacks = [recorded(scene, drawn(shape, seed), variance, seed) for seed in range(count)]
     draws = np.random.default_rng(9)
     return [replace(stack, variance=rendering * draws.chisquare(16, stack.values.size) / 16) for stack in stacks]
 
@@ -62,8 +62,9 @@ def assert_same(shared: Reconstruction, alone: Reconstruction) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("known", [False, True], ids=["unknown truth", "known truth"])
-def test_frames_of_the_same_noise_are_those_of_single_runs(method: str, known: bool) -> None:
-    scene, model = described((19, 17), estimator=METHODS[method])
+@pytest.mark.parametrize("noise", [VARIANCE, pytest.param(1e-2, marks=pytest.mark.slow)])
+def test_frames_of_the_same_noise_are_those_of_single_runs(method: str, known: bool, noise: float) -> None:
+    scene, model = described((19, 17), estimator=METHODS[method], noise={"variance": noise})
     prepared = Prepared(model)
     for number, stack in enumerate(frames(scene, 2 if method == "frame" else 3)):
         truth = drawn((19, 17), number) if known else None

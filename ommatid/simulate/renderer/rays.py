@@ -67,8 +67,8 @@ class RayGenerator:
         self._placement = MILLIMETRES_AT_ORIGIN
         self._loaded: tuple[slice, list[Any], Any] | None = None  # of the last block of all pixels
         self._pitch = float(camera.pixel_pitch)
-        self._open = [float(part) for part in types[0].open]  # of all of these types,
-        self._height = camera.height(types[0])  # and so is this
+        # The same for all of these types:
+        self._open, self._height = [float(part) for part in types[0].open], camera.height(types[0])
         self._crossing = None
         if not camera.walls:
             from .crosstalk import Crosstalk

@@ -175,10 +175,13 @@ def _tables(camera: Camera, lens_type: LensType, offsets: IntArray, unit: int, b
     slanted = [(blur, share) for blur, share in blurs if blur.disk and blur.weight]
     if not slanted:
         return (table,)
-    upward, sideways = (
-        sum(share * _asymmetry(camera, lens_type, blur, sides, offsets, unit) for blur, share in slanted)
-        for sides in ((tall, wide), (wide, tall))
-    )
+
+    def along(sides: Sides) -> FloatArray:
+        parts = (share * _asymmetry(camera, lens_type, blur, sides, offsets, unit) for blur, share in slanted)
+        return sum(parts, np.zeros_like(table))
+
+    upward = along((tall, wide))
+    sideways = upward if tall == wide else along((wide, tall))
     return table, np.where(lit, upward, 0.0), np.where(lit, np.transpose(sideways), 0.0)
 
 

@@ -105,7 +105,7 @@ class RayGenerator:
         lanes = (block.stop - block.start) * passes * samples
         self.sampler.seed(seed, lanes)
         draws = ReseededSampler(self.sampler, seed, lanes)
-        rays = self._started(block, subset, Plan(passes, samples), self.sampler.next_2d(), draws)
+        rays = self._started(self._load(block, subset), Plan(passes, samples), self.sampler.next_2d(), draws)
         if draws.has_drawn or (self._has_world and self._sampler_name in RELATED_DRAWS):
             draws.reseeded()
         return rays
@@ -116,7 +116,7 @@ class RayGenerator:
         Mitsuba's sampler is not ready for what the rays meet.
         """
         draws = SobolDraws(seed, (block.stop - block.start) * passes * samples, samples)
-        return self._started(block, subset, Plan(passes, samples), draws.next_2d(), draws)
+        return self._started(self._load(block, subset), Plan(passes, samples), draws.next_2d(), draws)
 
     def middle_rays(
         self, samples: int, seed: int, block: slice, passes: int, subset: IntArray
@@ -130,11 +130,11 @@ class RayGenerator:
 
         lanes = (block.stop - block.start) * passes * samples
         self.lens.spreads = True
-        draws = SobolDraws(seed, lanes, samples)
-        rays = self._started(block, subset, Plan(passes, samples), mi.Point2f(0.5), draws)
+        draws, places = SobolDraws(seed, lanes, samples), self._load(block, subset)
+        rays = self._started(places, Plan(passes, samples), mi.Point2f(0.5), draws)
         self.lens.spreads = False
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, passes * samples)
-        x, y, z = (dr.gather(mi.Float, row, index) for row in self._load(block, subset)[0][:3])
+        x, y, z = (dr.gather(mi.Float, row, index) for row in places[0][:3])
         x, y = x + self._pitch / 2, y + self._pitch / 2
         slope = -4 * self._pitch / (x * x + y * y + z * z)  # of cos^4
         return rays, (self._open[0] * slope * y, self._open[1] * slope * x)
@@ -143,7 +143,7 @@ class RayGenerator:
         """Start the ray from the middle of each of some pixels of the group, of pinholes."""
         import mitsuba as mi
 
-        return self._started(slice(0, pixels.size), pixels, Plan(1, 1), mi.Point2f(0.5), None)
+        return self._started(self._load(slice(0, pixels.size), pixels), Plan(1, 1), mi.Point2f(0.5), None)
 
     def grid_rays(self, grid: Grid, passes: int, keys: IntArray, pixels: IntArray) -> Rays:
         """Start one ray per cell of a grid over each pixel and pass, of pinholes, by random numbers of each pixel.
@@ -161,7 +161,7 @@ class RayGenerator:
         key = mi.UInt32(keys[own].astype(np.uint32).ravel())
         number = dr.gather(mi.UInt32, mi.UInt32(numbers.astype(np.uint32)), of_pass // dr.opaque(mi.UInt32, passes))
         at = grid.position(lane, dr.gather(mi.UInt32, key, of_pass), number)
-        return self._started(slice(0, pixels.size), pixels, work, at, None)
+        return self._started(self._load(slice(0, pixels.size), pixels), work, at, None)
 
     def _load(self, block: slice, subset: IntArray | None) -> tuple[list[Any], Any]:
         """Load the places of the pixels of a block: coordinates and axes, and the number of each pixel's lens."""
@@ -176,18 +176,19 @@ class RayGenerator:
             self._loaded = block, coordinates, own
         return coordinates, own
 
-    def _started(self, block: slice, subset: IntArray | None, work: Plan, at: Any, draws: Any) -> Rays:
-        """Return the rays of the pixels of a block.
+    def _started(self, places: tuple[list[Any], Any], work: Plan, at: Any, draws: Any) -> Rays:
+        """Return the rays of some pixels.
 
+        places : of these, as of `_load`
         at : points of the open parts, in [0, 1)^2;  draws : of the other random numbers
         """
         import drjit as dr
         import mitsuba as mi
 
-        places, own = self._load(block, subset)
-        lanes = (block.stop - block.start) * work.total
+        coordinates, own = places
+        lanes = dr.width(own) * work.total
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, work.total)
-        corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in places)
+        corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in coordinates)
         down, across = self._open
         at = mi.Point2f((1 - across) / 2 + across * at.x, (1 - down) / 2 + down * at.y) * self._pitch
         if axes:

@@ -16,7 +16,7 @@ LEAPS = (2.0, 64.0)  # least and largest growth of the samples from one round to
 
 @dataclass(frozen=True)
 class SampleLaw:
-    """A variance proportional to 1 / passes and to a power of the samples in each, whose exponent is negated."""
+    """A variance that falls as 1 / passes and as samples^-exponent, with the samples of a pass."""
 
     exponent: float = INDEPENDENT
 

@@ -7,6 +7,7 @@ from typing import Any
 
 Lens = dict[str, Any]  # of `summary.describe`, with what `sharpness.describe` adds
 NO_LIGHT = "no light"
+ROUNDING = 1e-9  # below what any unit of the table resolves
 
 
 def lens_rows(lens_types: Sequence[Lens], optics: Sequence[Lens] = ()) -> list[tuple[str, ...]]:
@@ -28,7 +29,8 @@ def _scaled(scale: float, digits: str = ".3g") -> Callable[[float | None], str]:
     def formatted(value: float | None) -> str:
         if value is None:
             return NO_LIGHT
-        return format(value * scale, digits if abs(value * scale) < 1000 else ".0f")
+        shown = value * scale if abs(value * scale) > ROUNDING else 0.0
+        return format(shown, digits if abs(shown) < 1000 else ".0f")
 
     return formatted
 
@@ -91,6 +93,8 @@ QUANTITIES: tuple[tuple[str, str, Callable[[Lens], str]], ...] = (
     ("columns of f seen", *_of("sees_columns", _range)),
     ("measurements", *_of("measurements", str)),
     ("fill factor", *_of("fill_factor", str)),
+    ("pixel blur, um", *_of("pixel_blur", _scaled(1e3))),
+    ("pixel's contrast at Nyquist", *_of("pixel_contrast", _scaled(1))),
     ("field of view, °", *_of("field_of_view", _view)),
     ("focal length, mm", *_of("focal_length", _length)),
     ("lens to sensor, mm", *_of("sensor_depth", _length)),

@@ -65,7 +65,7 @@ def is_adaptive(scene: Scene) -> bool:
 
 def optics(camera: Camera) -> list[dict[str, Any]]:
     """Return the sharpness of the lens types in JSON's types; empty where all are pinholes."""
-    if all(lens_type.optics.is_pinhole for lens_type in camera.types):
+    if not camera.has_width:
         return []
     from ommatid.simulate.lenses.sharpness import describe
 

@@ -70,6 +70,18 @@ def describe(
     }
 
 
+def _pixel_blur(camera: Camera, lens_type: LensType) -> dict[str, float]:
+    """Return the blur of a type's pixels, mm, and what their open parts and it leave of the contrast at Nyquist."""
+    blur = lens_type.optics.pixel_blur
+    if blur is None:
+        return {}
+    left = [
+        float(np.sinc(float(part) / 2) * np.exp(-((np.pi * blur / camera.pixel_pitch) ** 2) / 2))
+        for part in lens_type.open
+    ]
+    return {"pixel_blur": blur, "pixel_contrast": min(left)}
+
+
 def _light_words(camera: Camera) -> str:
     if not camera.has_width:
         return "rays through pinholes"
@@ -87,6 +99,7 @@ def _lens_type(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         "pixels": list(lens_type.pixels),
         "step": lens_type.described_step,
         **({} if lens_type.is_open else {"fill_factor": lens_type.opening}),
+        **_pixel_blur(camera, lens_type),
         **({"steered": len(lens_type.steered)} if lens_type.steered else {}),
         "sees_rows": [float(end) for end in lens_type.bounds[0]],
         "sees_columns": [float(end) for end in lens_type.bounds[1]],

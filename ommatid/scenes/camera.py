@@ -129,6 +129,10 @@ class Camera:
         """Magnification of a type's image on the sensor, in lengths."""
         return self.depth(lens_type) / self.distance_of(lens_type)
 
+    def diffusion(self, lens_type: LensType) -> float:
+        """Standard deviation of the blur of a type's pixels on the target, in pixels of f; 0 without one."""
+        return (lens_type.optics.pixel_blur or 0.0) / self.pixel_pitch * float(lens_type.ratio)
+
     def focal_length(self, lens_type: LensType) -> float:
         """Focal length by the thin-lens equation, 1/focal_length = 1/focus + 1/depth."""
         return 1.0 / (1.0 / self.focus(lens_type) + 1.0 / self.depth(lens_type))
@@ -154,7 +158,7 @@ class Camera:
 
     @property
     def has_stock_sensors(self) -> bool:
-        """True if Mitsuba's own sensors render it: ideal pinholes before pixels that are all open."""
+        """True if Mitsuba's own sensors render it: ideal pinholes before pixels open as a whole, without blur."""
         return self.is_ideal_pinhole and all(lens_type.is_open for lens_type in self.types)
 
     @property
@@ -198,7 +202,9 @@ class Camera:
         return camera.has_box_footprints or (camera.has_structure and camera.unknowns > MOST_DENSE)
 
     def is_blurred(self, lens_type: LensType) -> bool:
-        """True if a point of the target is imaged as more than a point: by surfaces, defocus or diffraction."""
+        """True if a pixel sees more than a box: by surfaces, defocus, diffraction or its own blur."""
+        if lens_type.optics.pixel_blur is not None:
+            return True
         if lens_type.optics.aperture is None:
             return lens_type.optics.surfaces is not None
         return self.wavelength is not None or self.focus(lens_type) != self.distance_of(lens_type)
@@ -382,7 +388,8 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
             f" but a {rows} x {columns}-pixel target holds at most {most[0]} x {most[1]}"
         )
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # reading the scene replaced file names
-    optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale, lens.coating)
+    blur = scene.camera.pixel_blur
+    optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale, lens.coating, blur)
     part = scene.camera.fill_factor if lens.fill_factor is None else lens.fill_factor
     light = Fraction(1) if scene.camera.fill_light == "kept" else part[0] * part[1]
     lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics, open=part, light=light)

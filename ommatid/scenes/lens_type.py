@@ -35,6 +35,7 @@ class LensOptics:
     distortion : k1, k2 of the magnification factor 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner
     surfaces : of a real lens, from the target to the sensor;  scale : factor on the surfaces, or "fit"
     coating : reflectance of each surface to air;  absent: Fresnel's
+    pixel_blur : standard deviation, along an axis of the sensor, of the way of charges from where they are freed
     """
 
     aperture: float | None = None
@@ -43,10 +44,11 @@ class LensOptics:
     surfaces: tuple[Surface, ...] | None = None
     scale: float | str | None = None
     coating: float | None = None
+    pixel_blur: float | None = None
 
     @property
     def is_pinhole(self) -> bool:
-        """True for a pinhole without distortion."""
+        """True for a pinhole without distortion, before pixels without blur."""
         return self == LensOptics()
 
     @property
@@ -54,12 +56,17 @@ class LensOptics:
         """True if it has an aperture or surfaces: light of a point reaches it at more than one point."""
         return self.aperture is not None or self.surfaces is not None
 
+    @property
+    def draws_more(self) -> bool:
+        """True if a ray of a sensor pixel is drawn by more than its point in the pixel."""
+        return self.has_width or self.pixel_blur is not None
+
     def describe(self) -> dict[str, Any]:
         """The effects present, in JSON's types; part of fingerprints."""
         surfaces = None if self.surfaces is None else [surface.model_dump(mode="json") for surface in self.surfaces]
         effects: dict[str, Any] = {"aperture": self.aperture, "focus": self.focus, "scale": self.scale}
         effects["distortion"] = None if self.distortion is None else list(self.distortion)
-        effects |= {"surfaces": surfaces, "coating": self.coating}
+        effects |= {"surfaces": surfaces, "coating": self.coating, "pixel_blur": self.pixel_blur}
         return {name: value for name, value in effects.items() if value is not None}
 
 

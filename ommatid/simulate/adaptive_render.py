@@ -74,6 +74,7 @@ AllowedVariance = Callable[[FloatArray, slice], FloatArray]  # of light on some 
 SHARE = 0.1  # of the sensor's variance
 QUANTILES = np.linspace(0, 1, 11)  # of pixels, from which rays are predicted
 LONG = 60.0  # s, from which the cost of the rounds is said
+TIMED = 2**20  # rays whose time tells the speed: fewer take the time of compilation
 WORTH = 0.5  # of the planned rays, below which fewer samples are offered
 
 
@@ -131,7 +132,8 @@ def render_until(
         save()
     warned = False
     while unfinished := rounds.unfinished:
-        if limit == inf and not warned and all(rounds.sub_imagers[index].rounds for index in unfinished):
+        every = all(rounds.sub_imagers[index].rounds for index in unfinished)
+        if limit == inf and not warned and every and rounds.rays > TIMED:
             warned = _warn_of_cost(rounds, rounds.rays / max(clock() - start, 1e-9))
         for number, index in enumerate(unfinished):
             left = (limit - (clock() - start)) / (len(unfinished) - number)
@@ -182,7 +184,7 @@ class AdaptiveRounds:
         exact = (exact_plan(self._world, index, sampler, fast=renderer.is_fast) for index in range(len(self._slices)))
         self._exact = [plan if flat else None for plan in exact]
         quasi_random = flat and renderer.is_fast and sampler == "multijitter"
-        self._sobol = [quasi_random and sub.type.optics.has_width for sub in self._world.sub_imagers]
+        self._sobol = [quasi_random and sub.type.optics.draws_more for sub in self._world.sub_imagers]
         plans = [self._first(index) if plan is None else plan for index, plan in enumerate(self._exact)]
         self.sub_imagers = [SubImagerProgress(work, law) for work in plans]
 

@@ -63,8 +63,8 @@ def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
 
         if blurred:
             raise InputError(
-                f"camera.lens.{lens_type.name}: distortion or a rotated sub-imager with defocus or diffraction has no"
-                " closed form; run with calibration.method 'transport', or remove one of them"
+                f"camera.lens.{lens_type.name}: distortion or a rotated sub-imager with defocus, diffraction or"
+                " pixel_blur has no closed form; run with calibration.method 'transport', or remove one of them"
             )
         parts = [footprints.sub_matrix(camera, sub, pose_of(sub)) for sub in subs]
     elif blurred:
@@ -94,7 +94,9 @@ def true_matrix(camera: Camera) -> sparse.csr_array:
     if camera.tolerance is None:
         return ideal_matrix(camera)
     if not camera.has_sharp_footprints:
-        raise InputError("misaligned lenses with surfaces, defocus or diffraction have no closed form; calibrate them")
+        raise InputError(
+            "misaligned lenses with surfaces, defocus, diffraction or pixel_blur have no closed form; calibrate them"
+        )
     from ommatid.scenes.optics import footprints
 
     return footprints.matrix(camera, poses(camera))

@@ -9,6 +9,7 @@ from ommatid.runtime.errors import naming_source
 from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.optics.radial_density import DEVIATIONS
 from ommatid.scenes.setup import Setup
 
 from .adaptive_render import check_noise_target
@@ -71,8 +72,9 @@ def check_entries(camera: Camera, types: Iterable[LensType], method: str, why: s
 
     method : of the calibration;  why : H has entries
     """
+    swept = method == "points" and camera.has_box_footprints
     entries = [lens.measurements * min(_visible_pixels(camera, lens), camera.unknowns) for lens in types]
-    needed = ENTRY * sum(entries) + (SWEPT * max(entries, default=0) if method == "points" else 0)
+    needed = ENTRY * sum(entries) + (SWEPT * max(entries, default=0) if swept else 0)
     remedy = "crop the target or use fewer sub-imagers"
     if method != "ideal" and camera.is_applied:
         remedy = f"set calibration.method to 'ideal', whose kernels need no entries, or {remedy}"
@@ -83,7 +85,7 @@ def _visible_pixels(camera: Camera, lens_type: LensType) -> int:
     """Approximate number of pixels of f that a sensor pixel may see."""
     side = ceil(lens_type.ratio) + BESIDE
     if lens_type.optics.surfaces is not None:
-        side += 2 * ceil(_diffraction_reach(camera, lens_type))
+        side += 2 * ceil(_diffraction_reach(camera, lens_type) + DEVIATIONS * camera.diffusion(lens_type))
     elif camera.is_blurred(lens_type):
         from ommatid.scenes.optics.blur import blur_of
 

@@ -146,6 +146,10 @@ def test_the_time_limit_ends_rendering_after_the_first_round() -> None:
 def test_a_long_rendering_says_what_it_costs(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that jumps by 100 s makes it long: said once, with the rays; fewer samples are offered if worth it."""
     described = scene((14, 14), FRACTIONAL[:1], render={**AUTO, "sampler": "independent"}, noise={"variance": 2.0})
+    ticks = iter(range(0, 10**9, 100))
+    lit(described, clock=lambda: float(next(ticks)))
+    assert not caplog.messages, "few rays, most of whose time is that of compilation"
+    monkeypatch.setattr("ommatid.simulate.adaptive_render.TIMED", 0)
     for worth, offered in ((0.0, False), (math.inf, True)):
         monkeypatch.setattr("ommatid.simulate.adaptive_render.WORTH", worth)
         ticks = iter(range(0, 10**9, 100))

@@ -1,7 +1,8 @@
-"""H of thin lenses: footprints blurred by defocus and by diffraction.
+"""H of thin lenses and of pixels with a blur: footprints blurred by defocus, by diffraction and by charges' diffusion.
 
 Lengths are pixels of f. Every ray of a lens type is displaced on the target by a random vector: a point of the disk of
-defocus or, if the light has wavelengths, of the diffraction pattern of the defocused pupil (`diffraction`). Its
+defocus or, if the light has wavelengths, of the diffraction pattern of the defocused pupil (`diffraction`). Charges
+that diffuse across the sensor before they are collected add a Gaussian one. Its
 distribution is the same for all pixels and isotropic, so that
 
     H_ij = T(y, x) = E[trapezoid(y - dy) trapezoid(x - dx)],   trapezoid(t) = |[0, m] and [t, t + 1]| / m,
@@ -35,7 +36,16 @@ from ..fitted.kernel_shapes import KernelShapes
 from ..fitted.kernels import KernelFootprints, KernelPlaces
 from ..lens_type import LensType
 from .diffraction import MOST_WAVES, Pattern, end_of, pattern
-from .radial_density import RadialDensity, disk_density, disk_slant, moments, slopes
+from .radial_density import (
+    DEVIATIONS,
+    RadialDensity,
+    diffused,
+    disk_density,
+    disk_slant,
+    gaussian_density,
+    moments,
+    slopes,
+)
 
 MOST_REACH = 1000  # pixels of f
 MOST_WEIGHT = 1.0  # of f/0.5; beyond, the first order in the height of a pixel does not describe the cos^4 law
@@ -51,15 +61,22 @@ class Blur:
     airy : radius on the target where the Airy pattern (2 J1(v) / v)^2 has v = 1, 0 without diffraction
     weight : (aperture / 2 depth)^2: light through the lens's rim has (1 + weight)^-2 of the weight of that through its
         middle, the cos^4 law for a pixel on the lens's axis; 0 for a uniform pupil
+    diffusion : standard deviation along an axis of the Gaussian displacement by the pixels' blur, 0 without one
     """
 
     disk: float = 0.0
     airy: float = 0.0
     weight: float = 0.0
+    diffusion: float = 0.0
 
     @property
     def is_zero(self) -> bool:
         """True if no ray is displaced."""
+        return self.is_sharp and self.diffusion == 0
+
+    @property
+    def is_sharp(self) -> bool:
+        """True if the lens displaces no ray."""
         return self.disk == 0 and self.airy == 0
 
     @property
@@ -72,7 +89,8 @@ class Blur:
     @property
     def reach(self) -> float:
         """Largest displacement, which is added to a footprint on every side."""
-        return self.airy * end_of(self.waves) if self.airy else self.disk / 2
+        of_lens = self.airy * end_of(self.waves) if self.airy else self.disk / 2
+        return of_lens + DEVIATIONS * self.diffusion
 
     @property
     def pattern(self) -> Pattern:
@@ -82,32 +100,41 @@ class Blur:
     @property
     def spread_density(self) -> RadialDensity:
         """Density of the displacements."""
-        return self.pattern.spread_density(self.airy) if self.airy else disk_density(self.disk, self.weight)
+        if self.is_sharp:
+            return gaussian_density(self.diffusion)
+        return self._diffused(
+            self.pattern.spread_density(self.airy) if self.airy else disk_density(self.disk, self.weight)
+        )
 
     @property
     def slant_density(self) -> RadialDensity:
         """Density whose derivative along an axis is the change for a pupil that is brighter towards that axis."""
-        return self.pattern.slant_density(self.airy) if self.airy else disk_slant(self.disk, self.weight)
+        return self._diffused(
+            self.pattern.slant_density(self.airy) if self.airy else disk_slant(self.disk, self.weight)
+        )
+
+    def _diffused(self, density: RadialDensity) -> RadialDensity:
+        return diffused(density, self.diffusion) if self.diffusion else density
 
 
 Blurs = tuple[tuple[Blur, float], ...]  # of the wavelengths, with their shares of the light
 
 
 def blur_of(camera: Camera, lens_type: LensType, wavelength: float | None = None) -> Blur:
-    """The blur of a lens type at a wavelength, absent: the camera's; without one the disk of the rays.
+    """The blur of a lens type and its pixels at a wavelength, absent: the camera's; without one the disk of the rays.
 
     More than `MOST_WAVES` of defocus are a disk of rays too. Raises ValueError for a lens with surfaces, InputError for
     more blur than can be computed.
     """
     if lens_type.optics.surfaces is not None:
         raise ValueError(f"lens type '{lens_type.name}' has surfaces; expected a pinhole or a thin lens")
-    aperture = lens_type.optics.aperture
+    aperture, diffusion = lens_type.optics.aperture, camera.diffusion(lens_type)
     if aperture is None:
-        return Blur()
+        return Blur(diffusion=diffusion)
     wavelength = wavelength or camera.wavelength or 0.0
     disk = aperture * abs(1 - camera.distance_of(lens_type) / camera.focus(lens_type)) / camera.target_pitch
     airy = wavelength * camera.distance_of(lens_type) / np.pi / (aperture * camera.target_pitch)
-    blur = Blur(disk, airy, (aperture / (2 * camera.depth(lens_type))) ** 2)
+    blur = Blur(disk, airy, (aperture / (2 * camera.depth(lens_type))) ** 2, diffusion)
     if airy and blur.waves > MOST_WAVES:
         blur = replace(blur, airy=0.0)
     if blur.is_zero:

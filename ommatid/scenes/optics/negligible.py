@@ -19,7 +19,7 @@ from scipy import sparse, special
 
 from ..camera import Camera
 from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
-from ..lens_type import LensOptics, LensType
+from ..lens_type import LensType
 from ..scene import Scene
 from ..tables.estimation import PriorTable
 
@@ -71,7 +71,7 @@ def without_negligible_effects(scene: Scene, camera: Camera) -> tuple[Camera, tu
         if aperture is None:
             types.append(lens_type)
         else:
-            types.append(replace(lens_type, optics=LensOptics(distortion=lens_type.optics.distortion)))
+            types.append(replace(lens_type, optics=replace(lens_type.optics, aperture=None, focus=None)))
             skipped.append(aperture)
     return replace(camera, types=tuple(types)), tuple(skipped)
 
@@ -153,7 +153,7 @@ def _negligible_aperture(
         return SkippedEffect(what, "it is in focus: all rays of a sensor point meet on the target", WHITE / 2 * falloff)
     if blur.disk >= MOST_DISK:
         return None
-    change, mean_square = _change(camera, lens_type, Blur(), prior)
+    change, mean_square = _change(camera, lens_type, Blur(diffusion=blur.diffusion), prior)
     if mean_square > allowed:
         return None
     why = f"the disk of defocus is {blur.disk:.2g} pixels of f wide, and its effect is far below the noise"

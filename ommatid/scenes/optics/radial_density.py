@@ -12,9 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy.special import i0e
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 
+DEVIATIONS = 5.0  # of a Gaussian displacement; 4e-6 of it is longer
+PANEL = 2.5  # standard deviations, at most, of a panel of what has a Gaussian displacement
 NODES = 24  # per panel, over which the argument of a diffraction pattern grows by 4; the error is below J_24(4), 1e-17
 
 
@@ -86,6 +89,43 @@ def disk_slant(disk: float, weight: float) -> RadialDensity:
         return -r / radius * fall
 
     return RadialDensity(np.array([0.0, radius]), density, -radius / (2 * (1 + weight)))
+
+
+def gaussian_density(sigma: float) -> RadialDensity:
+    """Density of a displacement that has a normal distribution of deviation `sigma` along either axis."""
+    breaks = _subdivided(np.array([0.0, DEVIATIONS * sigma]), PANEL * sigma)
+    return RadialDensity(
+        breaks, lambda r: r / sigma**2 * np.exp(-np.square(r / sigma) / 2), -np.expm1(-(DEVIATIONS**2) / 2)
+    )
+
+
+def diffused(radial: RadialDensity, sigma: float) -> RadialDensity:
+    """Density of a displacement to which one is added whose density is `gaussian_density(sigma)`.
+
+    From a point at the radius s the sum reaches the radius r with Rice's density, r / sigma^2 exp(-(r^2 + s^2) / 2
+    sigma^2) I0(r s / sigma^2).
+    """
+    inner, outer = (
+        _subdivided(np.append(radial.breaks, ends), PANEL * sigma)
+        for ends in ([], [radial.breaks[-1] + DEVIATIONS * sigma])
+    )
+    (s, share), (r, weights) = panel_nodes(inner), panel_nodes(outer)
+    share = share * radial.density(s)
+    values = np.zeros(r.size)
+    for first in range(0, r.size, NODES):
+        at = r[first : first + NODES, None]
+        near = slice(*np.searchsorted(s, [at.min() - 2 * DEVIATIONS * sigma, at.max() + 2 * DEVIATIONS * sigma]))
+        rice = at / sigma**2 * np.exp(-np.square((at - s[near]) / sigma) / 2) * i0e(at * s[near] / sigma**2)
+        values[first : first + NODES] = rice @ share[near]
+    return RadialDensity(outer, PanelPolynomials(outer, values), float(weights @ values))
+
+
+def _subdivided(breaks: FloatArray, widest: float) -> FloatArray:
+    """Return breaks with more between them, so that no panel is wider."""
+    counts = np.maximum(np.ceil(np.diff(breaks) / widest), 1).astype(np.int64)
+    ends = zip(breaks[:-1], breaks[1:], counts, strict=True)
+    parts: list[FloatArray] = [np.linspace(low, high, int(count), endpoint=False) for low, high, count in ends]
+    return np.append(np.concatenate(parts), breaks[-1])
 
 
 PAIRS_AT_ONCE = 256

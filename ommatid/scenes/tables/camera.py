@@ -30,6 +30,7 @@ from .units import (
 
 Distortion = Annotated[float, Field(ge=-1000, le=1000)]
 RAYS = "none"  # wavelength of light that does not diffract
+PIXEL_BLUR = 0.02, 2.0  # least and largest, in pixels
 STEEPEST_TERM = 10.0  # sag at the rim over semi-diameter
 LENS_NAME = r"^[A-Za-z0-9_-]+$"
 MOST_TYPES, MOST_SUB_IMAGERS, MOST_SURFACES = 100, 1024, 200
@@ -263,6 +264,12 @@ class CameraTable(Table):
         exclude_if=lambda value: value == "lost",
         description='light beside the open parts; "kept": micro-lenses on the pixels gather the light of the whole',
     )
+    pixel_blur: Length | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="standard deviation, along an axis, by which charges diffuse across the sensor before a pixel"
+        " collects them; absent: not at all",
+    )
     sensor: CameraSensorTable | None = Field(
         default=None, description="outline of the sensor; absent: as large as needed"
     )
@@ -274,6 +281,16 @@ class CameraTable(Table):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"expected a different name for every lens type, got {name!r} twice")
+        return self
+
+    @model_validator(mode="after")
+    def _check_pixel_blur(self) -> CameraTable:
+        least, most = (factor * self.pixel_pitch for factor in PIXEL_BLUR)
+        if self.pixel_blur is not None and not least <= self.pixel_blur <= most * (1 + 1e-9):
+            raise ValueError(
+                f"expected a pixel_blur from {1e3 * least:.3g} um to {1e3 * most:.3g} um, {PIXEL_BLUR[0]:g} to"
+                f" {PIXEL_BLUR[1]:g} times the pixel_pitch, got {1e3 * self.pixel_blur:.3g} um; leave out a smaller one"
+            )
         return self
 
     @model_validator(mode="after")

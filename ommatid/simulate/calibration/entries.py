@@ -42,9 +42,9 @@ def rendered_model(
     scene, camera, start = setup.scene, setup.camera, perf_counter()
     record = dict[str, Any](method=scene.calibration.method)
 
-    # Wide kernels need as many sweeps of point sources as they have cells; their rays give the same H.
+    # Footprints that are no boxes need as many sweeps of point sources as they have cells; their rays give the same H.
     fast = not choose(scene.render.variant).startswith("scalar")
-    by_rays = fast and setup.is_applied and not camera.has_box_footprints
+    by_rays = fast and not camera.has_box_footprints
 
     def measure(subsets: Subsets | None) -> Responses:
         if setup.is_applied:  # then no memory was asked for entries

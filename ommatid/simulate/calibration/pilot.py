@@ -150,8 +150,8 @@ def pilot(setup: Setup, plans: Plans) -> Pilot:
     traced = _affordable(setup, plans)
     changed = setup_of_pilot(setup, samples=max(work.total for work in traced.values()), fit="none")
     model = rendered_model(changed, plans=traced, float64=scene.calibration.samples == "auto")
-    pinholes = all(lens.optics.aperture is None and lens.optics.surfaces is None for lens in setup.simulated.types)
-    law = SampleLaw.expected(scene.render.sampler) if pinholes else SampleLaw()
+    few = not any(lens.optics.draws_more for lens in setup.simulated.types)
+    law = SampleLaw.expected(scene.render.sampler) if few else SampleLaw()
     return Pilot(model, *_factor(setup.camera, traced, plans, law))
 
 

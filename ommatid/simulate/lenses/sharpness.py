@@ -51,7 +51,7 @@ def describe(camera: Camera) -> list[dict[str, Any]]:
     distortion : relative change of the magnification at the rim;  illumination : light there, relative to the axis
     Where no light arrives, and for waves where light is rays, values are None.
     """
-    return [_described(camera, lens_type) for lens_type in camera.types if not lens_type.optics.is_pinhole]
+    return [_described(camera, lens_type) for lens_type in camera.types if lens_type.optics.has_width]
 
 
 def depth_of_field(
@@ -119,7 +119,7 @@ def through_focus(camera: Camera) -> list[ThroughFocus]:
     """Return the curves of the lens types whose light is waves and reaches the rim."""
     curves: list[ThroughFocus] = []
     for lens_type in camera.types:
-        if lens_type.optics.is_pinhole or camera.wavelength is None:
+        if not lens_type.optics.has_width or camera.wavelength is None:
             continue
         field, depth = field_of(camera, lens_type, camera.wavelength), camera.depth(lens_type)
         if field.rays_suffice or field.wave(field.field, None) is None:

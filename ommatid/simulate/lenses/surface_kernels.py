@@ -22,10 +22,11 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, basis, terms
 from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.optics.radial_density import DEVIATIONS
 
 from .field import LensField, bands, check_waves, field_of
 from .point_spread import point_spread
-from .surface_matrix import overlaps
+from .surface_matrix import blur_of, diffused, overlaps
 
 CHARTS = {3: (2, 4), 5: (6,), 7: (8, 10), 12: (12, 14, 16)}  # nodes along a side of a quadrant, degrees for them
 HIGHEST = 16
@@ -64,18 +65,25 @@ class _FieldRows:
     def _row(self, field: LensField, x: float, y: float, beside: FloatArray) -> FloatArray:
         camera, wide = self.places.camera, self.places.width
         edges = _edges(camera, field, x, y, self.places.lens_type) - (beside - wide / 2)[:, None]
+        blur = blur_of(camera, self.places.lens_type)
         angle, height = float(np.arctan2(-x, y)), float(np.hypot(x, y))
         if field.rays_suffice:
             total = np.zeros((wide, wide))
             for wave, share in field.between(height):
                 across, up = wave.turned(angle).hits / camera.target_pitch
-                down = overlaps(edges[0], -up, wide, 0.0)
-                total += (down * (share * wave.light)[:, None]).T @ overlaps(edges[1], -across, wide, 0.0)
+                down, beside = (
+                    overlaps(each, -moved, wide, blur=part)
+                    for each, moved, part in zip(edges, (up, across), blur, strict=True)
+                )
+                total += (down * (share * wave.light)[:, None]).T @ beside
             return total
         spread = point_spread(field.lit_wave(height).turned(angle), field.grid)
-        offsets, cell = spread.offsets / camera.target_pitch, spread.cell / camera.target_pitch
+        cell = spread.cell / camera.target_pitch
+        sides = np.ptp(edges, axis=1) / cell
+        values = diffused(spread.values, (blur[0] * sides[0], blur[1] * sides[1]))
+        offsets = cell * (np.arange(len(values), dtype=np.float64) - len(values) // 2)
         down, across = (overlaps(each, -offsets, wide, cell) for each in edges)
-        return np.asarray(down.T @ spread.values @ across, dtype=np.float64)
+        return np.asarray(down.T @ values @ across, dtype=np.float64)
 
     def chart(self, nodes: FloatArray, *, ends: bool) -> tuple[FloatArray, FloatArray]:
         """Return pairs of u and v in a quadrant, (pairs, 2), and the rows there, (pairs, W^2).
@@ -146,7 +154,7 @@ def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[LensField, 
         halves = np.outer([float(side) / 2 for side in lens_type.footprint], [-1.0, 1.0])
         moved = np.abs(edges - corner[:, None] - halves).max()
         reach = max(reach, wide / camera.target_pitch + float(moved))
-    return ceil(reach) + 1
+    return ceil(reach + DEVIATIONS * camera.diffusion(lens_type)) + 1
 
 
 def _fitted(field: FloatArray, entries: FloatArray, wide: int, degree: int) -> FloatArray:

@@ -7,6 +7,9 @@ overlap is the second difference B(b - c) - B(b - d) + B(a - d) - B(a - c) of B(
 the point-spread function holds no frequency above 1 / 2D; the sum over the grid is exact where B is freed of these too,
 
     B(t) = (t Si(W t) + cos(W t) / W) / pi,   W = pi / D,   Si the sine integral (Shannon's sampling theorem).
+
+The blur of pixels convolves all with a Gaussian: for rays B(t) becomes t (Phi(t / s) - 1/2) + s phi(t / s), and waves'
+point-spread functions are convolved on their grid. Its deviation is in proportion to the footprint.
 """
 
 from __future__ import annotations
@@ -15,16 +18,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import groupby
-from math import pi
+from math import ceil, pi
 
 import numpy as np
-from scipy import sparse
-from scipy.special import sici
+from scipy import fft, ndimage, sparse
+from scipy.special import ndtr, sici
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.optics.radial_density import DEVIATIONS
 from ommatid.scenes.pose import corner_offset, pose_of
 
 from .field import LensField, bands, check_waves, field_of
@@ -38,12 +42,14 @@ class _PixelFootprints:
     """Sensor pixels of a lens type, in the order of measurements.
 
     x, y : (M,) middle, mm from the lens's axis;  rows, columns : (M, 2) edges of the footprint
+    blur : standard deviation of the pixels' blur over the sides of their open part, down and across
     """
 
     x: FloatArray
     y: FloatArray
     rows: FloatArray
     columns: FloatArray
+    blur: tuple[float, float]
 
 
 @lru_cache(maxsize=4)
@@ -91,13 +97,20 @@ def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _PixelFoot
         rows = [camera.rows / 2 - edge / camera.target_pitch for edge in (upper, lower)]
         parts.append(np.stack([x, y, *rows, *columns]))
     x, y, *edges = np.concatenate(parts, axis=1)
-    return _PixelFootprints(x, y, np.stack(edges[:2], axis=1), np.stack(edges[2:], axis=1))
+    return _PixelFootprints(x, y, np.stack(edges[:2], axis=1), np.stack(edges[2:], axis=1), blur_of(camera, lens_type))
+
+
+def blur_of(camera: Camera, lens_type: LensType) -> tuple[float, float]:
+    """Return the standard deviation of the blur of a type's pixels over the sides of their open part."""
+    deviation = (lens_type.optics.pixel_blur or 0.0) / camera.pixel_pitch
+    return deviation / float(lens_type.open[0]), deviation / float(lens_type.open[1])
 
 
 def _rows(camera: Camera, field: LensField, pixels: _PixelFootprints) -> sparse.csr_array:
     count = pixels.x.size
     wide = max(field.grid[1] if not field.rays_suffice else 0.0, max(wave.spot_radius for wave in field.nodes[1]))
-    side = [min(size, float(np.ptp(pixels.rows[0])) + 2 * wide / camera.target_pitch + 2) for size in camera.shape]
+    own = float(np.ptp(pixels.rows[0])) * (1 + 2 * DEVIATIONS * pixels.blur[0])
+    side = [min(size, own + 2 * wide / camera.target_pitch + 2) for size in camera.shape]
     needed = int(count * side[0] * side[1]) * ENTRY
     check_memory(needed, "H of a lens with surfaces", "crop the target or use fewer sub-imagers")
     rows: list[sparse.csr_array] = [sparse.csr_array((1, camera.unknowns))] * count
@@ -118,8 +131,8 @@ def _by_rays(
         values = np.zeros(camera.shape)
         for wave, share in field.between(float(np.hypot(x, y))):
             across, up = wave.turned(float(np.arctan2(-x, y))).hits / camera.target_pitch
-            down = overlaps(pixels.rows[pixel], -up, camera.rows, 0.0)
-            beside = overlaps(pixels.columns[pixel], -across, camera.columns, 0.0)
+            down = overlaps(pixels.rows[pixel], -up, camera.rows, blur=pixels.blur[0])
+            beside = overlaps(pixels.columns[pixel], -across, camera.columns, blur=pixels.blur[1])
             values += (down * (share * wave.light)[:, None]).T @ beside
         yield pixel, values
 
@@ -134,12 +147,14 @@ def _by_waves(
     for (turn, level), members in groupby(sorted(keys, key=keys.__getitem__), key=keys.__getitem__):
         if turn != before:
             spread_at, before = field.spreads(pi / 2 * turn / levels[1]), turn
-        spread = spread_at(field.field * level / levels[0])
-        offsets: FloatArray = cell * (np.arange(len(spread), dtype=np.float64) - len(spread) // 2)
+        sharp = spread_at(field.field * level / levels[0])
         for pixel in members:
             x, y = pixels.x[pixel], pixels.y[pixel]
-            turned = spread.T if abs(x) > abs(y) else spread
+            turned = sharp.T if abs(x) > abs(y) else sharp
             turned = turned[:: -1 if y < 0 else 1, :: -1 if x < 0 else 1]
+            sides = np.ptp(pixels.rows[pixel]) / cell, np.ptp(pixels.columns[pixel]) / cell
+            turned = diffused(turned, (pixels.blur[0] * sides[0], pixels.blur[1] * sides[1]))
+            offsets: FloatArray = cell * (np.arange(len(turned), dtype=np.float64) - len(turned) // 2)
             down = overlaps(pixels.rows[pixel], -offsets, camera.rows, cell)
             beside = overlaps(pixels.columns[pixel], -offsets, camera.columns, cell)
             yield pixel, np.asarray(down.T @ turned @ beside, dtype=np.float64)
@@ -152,19 +167,32 @@ def _key(field: LensField, x: float, y: float) -> tuple[int, int]:
     return round(angle / (pi / 2) * turns), round(float(np.hypot(x, y)) / field.field * levels)
 
 
-def overlaps(edges: FloatArray, offsets: FloatArray, size: int, cell: float) -> FloatArray:
+def overlaps(edges: FloatArray, offsets: FloatArray, size: int, cell: float = 0.0, blur: float = 0.0) -> FloatArray:
     """Return the share of the interval between two edges, moved by each offset, in each texel: (n, size).
 
     cell : spacing of the offsets, whose frequencies are left out; 0: none
+    blur : standard deviation of a Gaussian by which it is moved in addition, over its length, where no cell is given
     """
     low, high = edges.min(), edges.max()
     texels = np.arange(size + 1)
-    upper, lower = (_integral(edge + offsets[:, None] - texels, cell) for edge in (high, low))
+    upper, lower = (_integral(edge + offsets[:, None] - texels, cell, blur * (high - low)) for edge in (high, low))
     return (upper[:, :-1] - upper[:, 1:] + lower[:, 1:] - lower[:, :-1]) / (high - low)
 
 
-def _integral(t: FloatArray, cell: float) -> FloatArray:
-    if cell == 0:
-        return np.abs(t) / 2
-    rate = pi / cell
-    return (t * sici(rate * t)[0] + np.cos(rate * t) / rate) / pi
+def _integral(t: FloatArray, cell: float, deviation: float) -> FloatArray:
+    if cell:
+        rate = pi / cell
+        return (t * sici(rate * t)[0] + np.cos(rate * t) / rate) / pi
+    if deviation:
+        at = t / deviation
+        return t * (ndtr(at) - 0.5) + deviation / np.sqrt(2 * pi) * np.exp(-np.square(at) / 2)
+    return np.abs(t) / 2
+
+
+def diffused(spread: FloatArray, deviations: tuple[float, float]) -> FloatArray:
+    """Convolve a point-spread function, (n, n), with a Gaussian of standard deviations in cells: (n + k, n + k)."""
+    if not any(deviations):
+        return spread
+    more = ceil(DEVIATIONS * max(deviations))
+    moved = fft.fft2(np.pad(spread, more))
+    return np.asarray(fft.ifft2(ndimage.fourier_gaussian(moved, deviations)).real, dtype=np.float64)

@@ -3,8 +3,8 @@
 The samples of one pixel are adjacent lanes, so that a pixel's sum is the sum of a block, in float64 and the same on any
 number of threads. Positions of pixels are computed for one block at a time, so that memory does not grow with the film.
 A random number is drawn for an effect only if the lenses have it: two for the position in the pixel,
-two more for an aperture, one more for several wavelengths, and without walls one for the lens. Lengths are
-millimetres.
+two more for an aperture and for the blur of pixels, one more for several wavelengths, and without walls one for the
+lens. Lengths are millimetres.
 """
 
 # pyright: basic
@@ -69,6 +69,7 @@ class RayGenerator:
         self._pitch = float(camera.pixel_pitch)
         # The same for all of these types:
         self._open, self._height = [float(part) for part in types[0].open], camera.height(types[0])
+        self._blur = types[0].optics.pixel_blur
         self._crossing = None
         if not camera.walls:
             from .crosstalk import Crosstalk
@@ -136,7 +137,7 @@ class RayGenerator:
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, passes * samples)
         x, y, z = (dr.gather(mi.Float, row, index) for row in places[0][:3])
         x, y = x + self._pitch / 2, y + self._pitch / 2
-        slope = -4 * self._pitch / (x * x + y * y + z * z)  # of cos^4
+        slope = -4 * self._pitch / (x * x + y * y + z * z) if self.lens.has_weights else 0.0  # of cos^4
         return rays, (self._open[0] * slope * y, self._open[1] * slope * x)
 
     def middles(self, pixels: IntArray) -> Rays:
@@ -191,6 +192,8 @@ class RayGenerator:
         corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in coordinates)
         down, across = self._open
         at = mi.Point2f((1 - across) / 2 + across * at.x, (1 - down) / 2 + down * at.y) * self._pitch
+        if self._blur is not None:
+            at += self._blur * mi.warp.square_to_std_normal(draws.next_2d())
         if axes:
             x = corner_x + axes[0] * at.x + axes[1] * at.y
             y = corner_y + axes[2] * at.x + axes[3] * at.y

@@ -22,6 +22,7 @@ from ommatid.runtime.streams import block_seed
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.optics.radial_density import DEVIATIONS
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.estimation import Sampler
 
@@ -306,7 +307,8 @@ class Renderer:
 
     def tail(self, group: str) -> float:
         """Return the pixels of f by which rare rays of a group may land further out than others."""
-        return self._generators[group].lens.tail
+        blur = DEVIATIONS * max(self.camera.diffusion(lens_type) for lens_type in self.groups[group])
+        return self._generators[group].lens.tail + blur
 
     def captured(self, group: str) -> float:
         """Return the share of the light that the rays of a group represent; the rest lands far away."""

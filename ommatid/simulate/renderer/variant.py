@@ -142,10 +142,10 @@ def choose(requested: str) -> str:
 
 
 def check_fast_variant(camera: Camera, variant: str) -> None:
-    """Raise InputError if a camera has lenses or fill factors that Mitsuba's scalar backend does not render."""
+    """Raise InputError if a camera has lenses or pixels that Mitsuba's scalar backend does not render."""
     if variant.startswith("scalar") and not camera.has_stock_sensors:
         raise InputError(
-            "a camera.fill_factor below 1 and"
+            "a camera.fill_factor below 1, camera.pixel_blur and"
             f" lenses that are more than pinholes need Mitsuba's fast backend, got {variant}; {remedy()}"
         )
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Mapping
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +27,8 @@ def fill(template: str, content: Mapping[str, Any]) -> str:
     """
     files = {"css": "page.css", "print_css": "print.css", "js": "page.js"}
     trusted = {name: Markup((TEMPLATES / file).read_text(encoding="utf-8")) for name, file in files.items()}
-    return printable_lines(rendered(template, {**content, **trusted}))
+    digest = b64encode(sha256(f"\n{trusted['js']}\n".encode()).digest()).decode()  # of the program alone that may run
+    return printable_lines(rendered(template, {**content, **trusted, "js_digest": f"sha256-{digest}"}))
 
 
 def rendered(template: str, content: Mapping[str, Any]) -> str:

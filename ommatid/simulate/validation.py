@@ -72,7 +72,7 @@ def check_entries(camera: Camera, types: Iterable[LensType], method: str, why: s
 
     method : of the calibration;  why : H has entries
     """
-    swept = method == "points" and camera.has_box_footprints
+    swept = method == "points" and camera.is_ideal_pinhole
     entries = [lens.measurements * min(_visible_pixels(camera, lens), camera.unknowns) for lens in types]
     needed = ENTRY * sum(entries) + (SWEPT * max(entries, default=0) if swept else 0)
     remedy = "crop the target or use fewer sub-imagers"

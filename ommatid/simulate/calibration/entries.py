@@ -20,7 +20,6 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
 from ..ideal import ideal_matrix
-from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint
 from ..sampling.passes import rounding_variance
 from ..validation import check_entries
@@ -42,20 +41,19 @@ def rendered_model(
     scene, camera, start = setup.scene, setup.camera, perf_counter()
     record = dict[str, Any](method=scene.calibration.method)
 
-    # Footprints that are no boxes need as many sweeps of point sources as they have cells; their rays give the same H.
-    fast = not choose(scene.render.variant).startswith("scalar")
-    by_rays = fast and not camera.has_box_footprints
+    # Point sources behind other lenses need as many renderings as the widest footprint has pixels, for the same H.
+    by_points = scene.calibration.method == "points" and setup.simulated.is_ideal_pinhole
 
     def measure(subsets: Subsets | None) -> Responses:
         if setup.is_applied:  # then no memory was asked for entries
             whole = [lens for lens in camera.types if subsets is None or _is_whole(subsets, lens)]
             check_entries(camera, whole, scene.calibration.method, "few numbers do not explain all of H: ")
-        if scene.calibration.method == "transport" or by_rays:
+        if by_points:
+            responses = responses_from_points(setup, progress, checkpoint, plans, subsets)
+        else:
             from .ray_transport import responses_from_rays
 
             responses = responses_from_rays(setup, progress, plans, subsets)
-        else:
-            responses = responses_from_points(setup, progress, checkpoint, plans, subsets)
         return replace(responses, float32_samples=1) if float64 else responses
 
     if fits(setup):

@@ -1,8 +1,7 @@
-"""Point sources: emitters of radiance 1 that fill one pixel of f, a grid of them at a time.
+"""Point sources behind pinholes: emitters of radiance 1 that fill one pixel of f, a grid of them at a time.
 
 The grid's spacing is wider than any sensor pixel's footprint, so every sensor pixel sees at most one of its sources,
-and sweeping the grid over all its offsets lights every pixel of f once: H column by column. The footprint of ideal
-pinholes follows from the geometry; for every other lens some rays are traced ahead. Through pinholes several
+and sweeping the grid over all its offsets lights every pixel of f once: H column by column. Several
 grids shine at once, each so much brighter than the previous one that the sum of a pixel's rays, every one of which
 brings back one source whole, encodes how many came from each. All sweeps of one pass share a seed, so that the errors
 of a row of H cancel in its sum; none is shared with the data.
@@ -44,8 +43,6 @@ Part = tuple[sparse.csr_array, FloatArray, Float32Array]
 Plans = dict[str, Plan]  # by the name of a group
 Subsets = dict[str, IntArray | None]  # pixels of a group, None: all, by its name
 MARGIN = Fraction(1, 1024)  # pixels of f by which rays may land beside a footprint: far more than they are rounded
-SCOUTS = 1024  # rays per pixel that are traced ahead
-BESIDE = 2  # pixels of f by which other rays may land beside those
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,7 @@ def responses_from_points(
     plans: Plans | None = None,
     subsets: Subsets | None = None,
 ) -> Responses:
-    """Measure H by sweeping grids of point sources over the target.
+    """Measure H of ideal pinholes by sweeping grids of point sources over the target.
 
     plans : of each group; None: all as the scene says
     subsets : groups, and their pixels, that are measured; rows of H of all others are empty; None: all
@@ -157,7 +154,7 @@ class SourceSweep:
     """Readings of all sensor pixels of a group for every grid, pass by pass.
 
     tally : (pixels of the group, offsets of the grid);  batches : the same, per batch of passes
-    uniform : (pixels,), of a uniform target;  dark : (pixels,), True if no ray of some pass reaches the target
+    uniform : (pixels,), of a uniform target
     """
 
     def __init__(self, renderer: Renderer, group: str, subset: IntArray | None = None) -> None:
@@ -166,25 +163,23 @@ class SourceSweep:
         self.visible = visible_pixels(renderer, group, subset)
         shape = self.visible.row.size, self.visible.spacing**2
         self.tally, self.uniform = Tally(*shape), Tally(shape[0])
-        self.dark = np.zeros(shape[0], dtype=np.bool_)
         self.batches = np.zeros((BATCHES, *shape), dtype=np.float32)
 
     def state(self) -> State:
         """Return the arrays of a checkpoint."""
         tallies = {**self.tally.state(self._group), **self.uniform.state(f"{self._group}.uniform")}
-        return {**tallies, f"{self._group}.batches": self.batches, f"{self._group}.dark": self.dark}
+        return {**tallies, f"{self._group}.batches": self.batches}
 
     def resume(self, state: State) -> None:
         """Continue from a checkpoint, if it holds this group."""
         self.tally.resume(self._group, state)
         self.uniform.resume(f"{self._group}.uniform", state)
         self.batches = state.get(f"{self._group}.batches", self.batches)
-        self.dark = state.get(f"{self._group}.dark", self.dark)
 
     def add_pass(self, work: Plan, seed: int, progress: Progress) -> None:
         """Render the next pass."""
         renderer, number, spacing = self._renderer, self.tally.count, self.visible.spacing
-        levels = brightness(work.samples, renderer.exact_below if renderer.has_equal_weights else 0)
+        levels = brightness(work.samples, renderer.exact_below)
         offsets, together = spacing**2, renderer.channels * levels.size
         values = np.empty(self.tally.mean.shape)
         pass_seeds = sampler_seeds(seed, "calibration", number, work.passes)
@@ -203,15 +198,12 @@ class SourceSweep:
         self.tally.add(values)
 
     def _read(self, samples: int, seeds: Callable[[int], int]) -> FloatArray:
-        readings = self._renderer.expose(self._group, samples, seeds, self._subset)
-        self.dark |= np.isnan(readings[0])
-        return np.nan_to_num(readings)
+        return self._renderer.expose(self._group, samples, seeds, self._subset)
 
     def part(self, work: Plan) -> Part:
-        """Return the rows of H, without entries for pixels that some pass leaves dark. Raises MachineError."""
-        lit = ~self.dark
-        matrix, order = entries_of(self._renderer.camera, self.visible, self.tally.mean * lit[:, None])
-        _check_rows(matrix, self.uniform.mean * lit, ROW_TOLERANCE + STRAYS / work.total)
+        """Return the rows of H. Raises MachineError."""
+        matrix, order = entries_of(self._renderer.camera, self.visible, self.tally.mean)
+        _check_rows(matrix, self.uniform.mean, ROW_TOLERANCE + STRAYS / work.total)
         batches = (self.batches.reshape(BATCHES, -1)[:, order] - matrix.data).astype(np.float32)
         return matrix, self.tally.variance.ravel()[order], batches
 
@@ -219,7 +211,7 @@ class SourceSweep:
 def brightness(samples: int, exact_below: int) -> IntArray:
     """Return the radiances of grids that shine together: powers of more than `samples`, as many as add up exactly.
 
-    exact_below : limit of exact sums of whole numbers, 0 if rays do not bring back sources whole
+    exact_below : limit of exact sums of whole numbers
     """
     base = 1 << samples.bit_length()
     levels = [1]
@@ -289,8 +281,6 @@ class VisiblePixels:
 def visible_pixels(renderer: Renderer, group: str, subset: IntArray | None = None) -> VisiblePixels:
     """Return the visible pixels of a group of the renderer, which is one lens type, or of a subset of its pixels."""
     (lens_type,) = renderer.groups[group]
-    if not renderer.camera.is_ideal_pinhole:
-        return _traced(renderer, group, subset)
     visible = of_pinholes(renderer.camera, lens_type)
     return visible if subset is None else replace(visible, row=visible.row[subset], column=visible.column[subset])
 
@@ -307,24 +297,3 @@ def of_pinholes(camera: Camera, lens_type: LensType) -> VisiblePixels:
         rows.append(np.repeat(first[0], lens_type.pixels[1]))
         columns.append(np.tile(first[1], lens_type.pixels[0]))
     return VisiblePixels(np.concatenate(rows), np.concatenate(columns), ceil(lens_type.ratio) + 2)
-
-
-def _traced(renderer: Renderer, group: str, subset: IntArray | None) -> VisiblePixels:
-    camera = renderer.camera
-    sizes, (lens_type,) = camera.shape, renderer.groups[group]
-    pixels = lens_type.measurements if subset is None else subset.size
-    first = [np.full(pixels, size) for size in sizes]
-    last = [np.full(pixels, -1) for _ in sizes]
-    for block in renderer.blocks(group, SCOUTS, subset):
-        texels, _ = renderer.hits(group, SCOUTS, lambda index: index, block, subset)  # only bounds are taken from them
-        seen = texels >= 0
-        for axis, indices in enumerate(np.divmod(texels, camera.columns)):
-            first[axis][block] = np.where(seen, indices, sizes[axis]).min(axis=1)
-            last[axis][block] = np.where(seen, indices, -1).max(axis=1)
-    beside = BESIDE + ceil(renderer.tail(group))
-    ends = [
-        (np.clip(low - beside, 0, size - 1), np.clip(high + beside, 0, size - 1))
-        for low, high, size in zip(first, last, sizes, strict=True)
-    ]
-    spacing = max(int((high - low).max()) + 1 for low, high in ends)
-    return VisiblePixels(ends[0][0], ends[1][0], spacing)

@@ -44,8 +44,8 @@ def responses_from_rays(
     from ..renderer.renderer import Renderer
 
     scene, variant = setup.scene, choose(setup.scene.render.variant)
-    check_transport_variant(variant)
     renderer = Renderer(setup.simulated, variant, scene.render.sampler, together=False)
+    check_transport_variant(variant)
     plans = same_plans(setup) if plans is None else plans
     parts: dict[str, list[Part]] = {group: [] for group in renderer.groups}
     chosen: Subsets = dict.fromkeys(renderer.groups) if subsets is None else subsets

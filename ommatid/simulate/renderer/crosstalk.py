@@ -29,7 +29,6 @@ class Crosstalk:
 
         names = list(models)
         self._models = [models[name] for name in names]
-        self.tail = max(model.tail for model in self._models)
         self._others = len(camera.sub_imagers) - 1
         places = np.array([pose.lens for pose in poses(camera)], dtype=np.float32).T
         self._x, self._y = (mi.Float(np.ascontiguousarray(row)) for row in places)

@@ -21,7 +21,6 @@ import numpy as np
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.blur import blurs_of
 from ommatid.scenes.optics.diffraction import QUANTILES, pattern
 
 from ..lenses.ray_trace import reach
@@ -52,7 +51,6 @@ class DiffractingLens(LensModel):
         self._weight = (aperture / (2 * self._depth)) ** 2
         self._bands = [(wavelength, share) for wavelength, share in camera.wavelengths]
         self._limits = mi.Float(np.cumsum([share for _, share in self._bands])[:-1].astype(np.float32))
-        self.tail = max(blur.reach for blur, _ in blurs_of(camera, lens_type))
         _, least, largest = reach(camera, lens_type)
         self._tabulate([1 / camera.distance_of(lens_type) + 1 / depth - 1 / self._depth for depth in (least, largest)])
 

@@ -51,7 +51,6 @@ class LensModel:
     """A pinhole, with or without distortion."""
 
     has_weights = False  # True if rays carry different amounts of light
-    tail = 0.0  # pixels of f by which rare rays land outside the footprint of the others
     captured = 1.0  # share of the light that the rays represent
     spreads = False  # True to send more rays to the faint parts of the point spread, with less weight
 

@@ -76,7 +76,6 @@ class RayGenerator:
 
             models = {lens_type.name: lens_of(camera, lens_type) for lens_type in camera.types}
             self._crossing = Crosstalk(camera, models)
-            self.lens.tail = self._crossing.tail
 
     def follow(self, distance: Distance, placement: Placement) -> None:
         """Tell all lenses how far the surfaces of a world are, and where the camera stands in it."""

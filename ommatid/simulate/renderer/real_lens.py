@@ -71,7 +71,6 @@ class WaveLens(RealLens):
         self._distance: Distance | None = None
         _, least, largest = reach(camera, lens_type)
         self._shifts = [1 / depth - 1 / self._depth for depth in (largest, least)]
-        self.tail = max(field.grid[1] for field, _ in fields) / camera.target_pitch
         self._tabulate([self._vergence + shift for shift in self._shifts], CELLS, GRID_REACH)
 
     def follow(self, distance: Distance) -> None:

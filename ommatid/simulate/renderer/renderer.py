@@ -22,7 +22,6 @@ from ommatid.runtime.streams import block_seed
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.radial_density import DEVIATIONS
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.estimation import Sampler
 
@@ -111,11 +110,6 @@ class Renderer:
     def direct_only(self) -> bool:
         """True if interreflections in a world are left out, since nothing there reflects."""
         return self.staged is not None and self.staged.direct_only
-
-    @property
-    def has_equal_weights(self) -> bool:
-        """True if all rays of a pixel carry the same light."""
-        return not any(generator.lens.has_weights for generator in self._generators.values())
 
     def float32_samples(self, samples: int) -> int:
         """Return how many of a pixel's samples are summed in float32: one if sums are float64."""
@@ -304,11 +298,6 @@ class Renderer:
         texels = np.rint(np.array(radiance)).astype(np.int64) - 1
         weight = None if rays.weight is None else np.array(rays.weight, dtype=np.float64).reshape(-1, rays.samples)
         return texels.reshape(-1, rays.samples), weight
-
-    def tail(self, group: str) -> float:
-        """Return the pixels of f by which rare rays of a group may land further out than others."""
-        blur = DEVIATIONS * max(self.camera.diffusion(lens_type) for lens_type in self.groups[group])
-        return self._generators[group].lens.tail + blur
 
     def captured(self, group: str) -> float:
         """Return the share of the light that the rays of a group represent; the rest lands far away."""

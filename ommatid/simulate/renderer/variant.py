@@ -225,7 +225,10 @@ def diagnosis(statuses: list[BackendStatus]) -> str:
 
 
 def remedy() -> str:
-    """Return the command that installs the fast backend."""
+    """Return what to do for a fast backend: to take the one that works here, or the command that installs one."""
+    working = next((name for name in PREFERENCE if not name.startswith("scalar") and not unusable_reason(name)), None)
+    if working is not None:
+        return f"leave out render.variant, since '{working}' works here"
     if shutil.which("apt-get"):
         prefix = "" if os.geteuid() == 0 else "sudo "
         return f"run: {prefix}apt-get install -y libllvm19"

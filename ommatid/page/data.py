@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from ommatid.reconstruct.measured_error import best_single_sub_image, enlarged
 from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.result_files import ESTIMATE
+from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import real_path
 from ommatid.runtime.printable import printable
 from ommatid.scenes import model_file, stack
-from ommatid.scenes.formats import exr
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
@@ -77,7 +76,7 @@ class ResultMaps:
 
 def read_run(folder: Path, recorded: Stack | None = None, calibrated: Model | None = None) -> Run:
     """Read the run in a folder; stack and model are read only if they are not given. Raises InputError."""
-    channels = exr.read(folder / ESTIMATE)[0].channels
+    channels = read_estimate(folder / ESTIMATE).channels
     report = run_json.read(folder)
     recorded = stack.read(folder / "stack.exr") if recorded is None else recorded
     shapes = {name: channels[name].shape for name in ("estimate", "variance") if name in channels}
@@ -101,7 +100,7 @@ def read_parts(folder: Path) -> dict[str, Any]:
     """Read what a folder holds of a run: those of the fields of `Run` that are there. Raises InputError for damage."""
     stack_path, model_path = folder / "stack.exr", folder / "model.npz"
     return {
-        **(exr.read(folder / ESTIMATE)[0].channels if (folder / ESTIMATE).exists() else {}),
+        **(read_estimate(folder / ESTIMATE).channels if (folder / ESTIMATE).exists() else {}),
         **({"report": run_json.read(folder)} if (folder / run_json.RUN).exists() else {}),
         **({"stack": stack.read(stack_path)} if stack_path.exists() else {}),
         **({"model": model_file.read(model_path)} if model_path.exists() else {}),

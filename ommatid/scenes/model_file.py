@@ -163,6 +163,8 @@ def _seal(arrays: dict[str, NDArray[Any]], description: str) -> str:
 ENTRIES = ("indices", "indptr", "data")
 MOST_BATCHES = 1024
 MOST_TEXTS = 100
+MOST_DIRECTIONS = 256  # of errors that many measurements share, each of which costs a pass over all of them
+DIRECTIONS = {"own": 2, "shared": 2, "error_coefficients": 0}  # and the axis of these arrays that counts them
 LONGEST_TEXT = 2**26  # bytes of a text, four a character
 EXPECTED = {  # dimensions, kinds and bytes of a number
     **dict.fromkeys(("data", "variance"), (1, "f", (4, 8))),
@@ -181,6 +183,9 @@ def check_headers(headers: Headers) -> None:
                 raise ValueError(f"{name} is of type {dtype} and shape {shape}")
         elif dtype.kind in "US" and (int(np.prod(shape)) > MOST_TEXTS or dtype.itemsize > LONGEST_TEXT):
             raise ValueError(f"{name} has {dtype} texts of shape {shape}")
+        axis = DIRECTIONS.get(name.rpartition(".")[2])
+        if axis is not None and len(shape) == 3 and shape[axis] > MOST_DIRECTIONS:
+            raise ValueError(f"{name} has {shape[axis]} directions of errors, more than {MOST_DIRECTIONS}")
     if "shape" in headers and headers["shape"].shape != (2,):
         raise ValueError(f"shape is of shape {headers['shape'].shape}")
     if "batches" in headers and headers["batches"].shape[0] > MOST_BATCHES:

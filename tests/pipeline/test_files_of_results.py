@@ -223,3 +223,46 @@ def test_a_document_with_a_key_twice_is_refused(finished: Path, tmp_path: Path) 
     for read_again in (lambda: read_rows(tmp_path / "sweep.json"), lambda: run_json.read(tmp_path)):
         with pytest.raises(InputError, match=r"expected each key of a table once, got '\w+' twice; delete it"):
             read_again()
+
+
+CHANGES: tuple[tuple[str, dict[str, object]], ...] = (
+    ("error", {"predicted_mse": 0.0}),
+    ("study", {"model": "of another program"}),
+)
+
+
+@pytest.mark.parametrize(("table", "change"), CHANGES)
+def test_contradictions_in_a_report_are_refused(
+    table: str, change: dict[str, object], kept: Path, ommatid: Command
+) -> None:
+    content = json.loads((kept / "run.json").read_text(encoding="utf-8"))
+    case = {"mse": 1.0, "predicted": 1.0, "expected": 1.0, "low": 0.5, "high": 2.0, "seconds": 1.0}
+    content[table] = [{**case, **change}] if table == "study" else {**content[table], **change}
+    (kept / "run.json").write_text(json.dumps(content), encoding="utf-8")
+    result = ommatid("report", kept)
+    assert result.code == 2
+    assert f"run.json: expected the results of a run, got a file whose {table}" in result.err
+
+
+@pytest.mark.parametrize(("channel", "value"), [("estimate", np.nan), ("variance", np.inf), ("variance", -1.0)])
+def test_an_estimate_of_no_numbers_is_refused_and_made_again(
+    channel: str, value: float, kept: Path, ommatid: Command
+) -> None:
+    whole, (part,) = (kept / "estimate.exr").read_bytes(), exr.read(kept / "estimate.exr")
+    values = part.channels[channel].copy()
+    values[2, 1] = value
+    exr.write(kept / "estimate.exr", [exr.Part(part.name, {**part.channels, channel: values}, part.record)])
+    (kept / "report.html").unlink()
+    result = ommatid("report", kept)
+    assert result.code == 2
+    assert "estimate.exr: expected a finite estimate" in result.err
+    assert ommatid(*RUN).code == 0
+    assert (kept / "estimate.exr").read_bytes() == whole
+
+
+@pytest.mark.parametrize("name", ["estimate.png", "overview.png"])
+def test_a_picture_that_was_cut_short_is_made_again(name: str, kept: Path, ommatid: Command) -> None:
+    whole = (kept / name).read_bytes()
+    (kept / name).write_bytes(whole[:200])
+    assert ommatid(*RUN).code == 0
+    assert (kept / name).read_bytes() == whole

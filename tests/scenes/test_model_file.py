@@ -18,6 +18,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import digest
 from ommatid.scenes import model_file
 from ommatid.scenes.formats import npz
+from ommatid.scenes.formats.npz import Header
 from ommatid.scenes.formats.provenance import checked
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_model
@@ -114,6 +115,14 @@ def test_misleading_arrays_are_refused(original: Path, tmp_path: Path) -> None:
         sealed(tmp_path / "m.npz", arrays)
         with pytest.raises(InputError):
             model_file.read(tmp_path / "m.npz")
+
+
+@pytest.mark.parametrize("name", ["views.A.own", "views.B.shared", "kernels.A.error_coefficients"])
+def test_directions_of_errors_are_few(name: str) -> None:
+    """Each costs a pass over all measurements: a small file of very many would take hours."""
+    shape = (9, 5, 10**6) if name.startswith("views") else (10**6, 16, 1)
+    with pytest.raises(ValueError, match=f"{name} has 1000000 directions of errors, more than 256"):
+        model_file.check_headers({name: Header(shape, np.dtype(np.float64))})
 
 
 def test_records_hold_what_can_be() -> None:

@@ -13,6 +13,7 @@ from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import cached, digest, fingerprint, write_whole
+from ommatid.runtime.input_files import open_input
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import origin
 from ommatid.scenes.constants import WHITE
@@ -33,6 +34,7 @@ from .run_json import RegionReport, RunReport
 Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the corner, rows and columns
 
 PICTURE = "estimate.png"
+PNG_END = b"IEND\xaeB`\x82"
 ESTIMATOR_TABLES = ("prior", "estimator", "tiles")
 
 
@@ -104,6 +106,18 @@ def write_estimate(path: Path, restoration: Reconstruction, record: dict[str, An
     exr.write(path, [exr.Part("estimate", maps, record)])
 
 
+def read_estimate(path: Path) -> exr.Part:
+    """Read what `write_estimate` wrote. Raises InputError for another file, and for values that no estimate has."""
+    part = exr.read(path)[0]
+    for name in ("estimate", "variance"):
+        values = part.channels.get(name, np.zeros((0, 0), dtype=np.float32))
+        if not np.isfinite(values).all() or (name == "variance" and values.min(initial=0.0) < 0):
+            raise InputError(
+                f"{path}: expected a finite estimate and variances of at least 0, got others; run the scene again"
+            )
+    return part
+
+
 def write_picture(path: Path, estimate: FloatArray) -> None:
     """Write an estimate, (rows, columns), as 8-bit PNG, one pixel each; values outside 0 to 255 are clipped."""
     from skimage import io
@@ -139,10 +153,16 @@ def fingerprint_of(stack: Stack, model: Model) -> str:
 def _read_results(folder: Path) -> tuple[RunReport, str | None]:
     """Return run.json, and its fingerprint if all results are there, whole and of one reconstruction."""
     report = run_json.read(folder)
-    made_from = exr.read(folder / ESTIMATE)[0].record["fingerprint"]
-    whole = report.fingerprint == made_from and all((folder / name).is_file() for name in (PICTURE, OVERVIEW))
+    made_from = read_estimate(folder / ESTIMATE).record["fingerprint"]
+    whole = report.fingerprint == made_from and all(_is_whole(folder / name) for name in (PICTURE, OVERVIEW))
     earlier = report.verdict is None or (report.error.mse is not None and report.error.baseline is None)
     return report, made_from if whole and not earlier else None
+
+
+def _is_whole(picture: Path) -> bool:
+    """Return True if a PNG file has its end: a copy that was cut short has none."""
+    with open_input(picture) as stream:
+        return stream.read().endswith(PNG_END)
 
 
 def region_reports(outcome: Reconstruction, regions: Sequence[Region]) -> dict[str, Any]:

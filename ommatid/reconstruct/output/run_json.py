@@ -12,7 +12,7 @@ from math import log10
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, computed_field, field_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, computed_field, field_validator, model_validator
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
@@ -42,7 +42,7 @@ def time_spent(stages: Mapping[str, StageReport], error: ErrorReport, *, calibra
     """
     seconds = {name: stage.seconds for name, stage in stages.items()}
     parts = [error.budget[part] for part in STAGES.values()]
-    rest, total = error.predicted_mse - sum(parts), sum(seconds.values())
+    rest, total = max(error.predicted_mse - sum(parts), 0.0), sum(seconds.values())
     sampler = stages["render"].sampler
     if sampler is None:  # recorded frames
         return TimeReport(seconds=total, stages=seconds, noise_alone=rest)
@@ -152,6 +152,12 @@ class ErrorReport(Record):
     budget: dict[str, float]
     expected_given_truth: IntervalReport | None = None
     expected_given_estimate: Amount | None = None
+
+    @model_validator(mode="after")
+    def _check_parts(self) -> ErrorReport:
+        if self.predicted_mse == 0 and any(part > 0 for part in self.budget.values()):
+            raise ValueError("expected a predicted_mse above 0 beside a budget with parts")
+        return self
 
 
 class ResidualReport(Record):
@@ -325,7 +331,7 @@ class StudyCase(Record):
     Measured and expected errors are None without the truth, the latter also where it is not known.
     """
 
-    model: str
+    model: Literal["ideal", "points", "transport", "fitted", "true"]
     mse: Amount | None
     predicted: Amount
     expected: Amount | None

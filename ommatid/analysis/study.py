@@ -22,6 +22,7 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables.estimation import StudyModel
 from ommatid.simulate.calibrate import cached_model
 from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 from ommatid.simulate.ideal import ideal_model, true_model
@@ -59,7 +60,7 @@ def _with_misalignment(scene: Scene, name: str) -> Scene:
     return scene.model_copy(update={"estimator": estimator})
 
 
-def study_case(stack: Stack, name: str, model: Model, truth: FloatArray | None) -> StudyCase:
+def study_case(stack: Stack, name: StudyModel, model: Model, truth: FloatArray | None) -> StudyCase:
     """Reconstruct a stack with one model of H. Raises what `restore` raises."""
     stack = replace(stack, scene=_with_misalignment(stack.scene, name))
     restoration = restore(stack, model, truth)
@@ -78,7 +79,7 @@ def study_case(stack: Stack, name: str, model: Model, truth: FloatArray | None) 
 def cached_study(
     folder: Path,
     stack: Stack,
-    models: Mapping[str, Callable[[], Model]],
+    models: Mapping[StudyModel, Callable[[], Model]],
     truth: FloatArray | None,
     progress: Progress = no_progress,
 ) -> tuple[tuple[StudyCase, ...], bool]:
@@ -131,12 +132,12 @@ def rows(cases: Sequence[StudyCase]) -> list[tuple[str, str]]:
 
 def study_models(
     setup: Setup, folder: Path, progress: Progress, stopping_rule: StoppingRule | None = None
-) -> dict[str, Callable[[], Model]]:
+) -> dict[StudyModel, Callable[[], Model]]:
     """Return by name the functions that make the models of a scene's study; calibrated ones are cached in `folder`."""
 
     scene, camera = setup.scene, setup.calibrated.camera
 
-    def make(name: str) -> Model:
+    def make(name: StudyModel) -> Model:
         if name == "true":
             return true_model(setup.resolved, camera)
         if name not in ("points", "transport"):

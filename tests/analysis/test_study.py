@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,7 @@ from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables.estimation import StudyModel
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 
 from ..conftest import Command
@@ -125,7 +127,7 @@ def test_a_study_is_cached_and_printed(tmp_path: Path) -> None:
         made.append(name)
         return model if name != "true" else exact_model(stack.scene, stack.camera, true_matrix(stack.camera), "true")
 
-    models = {name: (lambda name=name: give(name)) for name in ("ideal", "true")}
+    models: dict[StudyModel, Callable[[], Model]] = {"ideal": lambda: give("ideal"), "true": lambda: give("true")}
     cases, fresh = study.cached_study(tmp_path, stack, models, truth)
     assert (fresh, made) == (True, ["ideal", "true"])
     assert study.cached_study(tmp_path, stack, models, truth) == (cases, False)

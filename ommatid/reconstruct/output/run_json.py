@@ -18,6 +18,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import read_record
 from ommatid.scenes.formats.provenance import FitRecord
+from ommatid.scenes.tables.estimation import StudyModel
 
 from ..prior import SpectralTerm
 
@@ -331,7 +332,7 @@ class StudyCase(Record):
     Measured and expected errors are None without the truth, the latter also where it is not known.
     """
 
-    model: Literal["ideal", "points", "transport", "fitted", "true"]
+    model: StudyModel
     mse: Amount | None
     predicted: Amount
     expected: Amount | None

@@ -191,11 +191,14 @@ class EstimatorTable(Table):
         return self
 
 
+StudyModel = Literal["ideal", "points", "transport", "fitted", "true"]
+
+
 class StudyTable(Table):
     """One stack reconstructed several times, each time with another model H."""
 
     models: Annotated[
-        tuple[Literal["ideal", "points", "transport", "fitted", "true"], ...],
+        tuple[StudyModel, ...],
         BeforeValidator(pair),
         Field(min_length=1),
     ] = Field(

@@ -113,8 +113,7 @@ def estimate_cost(member: Member, changes: Sequence[str], lenses: Sequence[str])
     except InputError:
         return CostEstimate(0.0, 0)
     calibration, samples = setup.scene.calibration, setup.scene.calibration.samples
-    sweeps = RENDERINGS if setup.simulated.is_ideal_pinhole else 1.0
-    rays_per_sample = {"points": sweeps, "transport": 1.0, "ideal": 0.0}[calibration.method]
+    rays_per_sample = 0.0 if calibration.method == "ideal" else RENDERINGS if setup.renders_points else 1.0
     calibration_rays = rays_per_sample * (IN_PLACE_OF_AUTO if samples == "auto" else samples)
     rays = setup.camera.measurements * (setup.scene.render.sample_count + calibration_rays)
     return CostEstimate(FIXED + rays / RAYS + choice.seconds, PROGRAM_MEMORY + choice.memory)

@@ -35,7 +35,7 @@ class LensOptics:
     distortion : k1, k2 of the magnification factor 1 + k1 r^2 + k2 r^4, r = 1 at the target's corner
     surfaces : of a real lens, from the target to the sensor;  scale : factor on the surfaces, or "fit"
     coating : reflectance of each surface to air;  absent: Fresnel's
-    pixel_blur : standard deviation, along an axis of the sensor, of the way of charges from where they are freed
+    pixel_blur : standard deviation, along an axis of the sensor, of the displacement of charges by diffusion
     """
 
     aperture: float | None = None

@@ -84,6 +84,14 @@ class Setup:
         return (calibration.method == "ideal" or calibration.fit != "none") and camera.is_applied
 
     @property
+    def renders_points(self) -> bool:
+        """True if point sources are rendered to calibrate H: of pinholes, all other lenses take the same rays.
+
+        Point sources behind those need as many renderings as the widest footprint has pixels.
+        """
+        return self.scene.calibration.method == "points" and self.calibrated.simulated.is_ideal_pinhole
+
+    @property
     def has_closed_form(self) -> bool:
         """True if H of the simulated camera with its misalignments has a closed form."""
         camera = self.simulated

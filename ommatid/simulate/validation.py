@@ -8,8 +8,8 @@ from math import ceil
 from ommatid.runtime.errors import naming_source
 from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import DEVIATIONS
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.radial_density import DEVIATIONS
 from ommatid.scenes.setup import Setup
 
 from .adaptive_render import check_noise_target
@@ -43,12 +43,12 @@ def check_scene(setup: Setup, calibrates: bool = True) -> None:
 
 def check_scene_memory(setup: Setup, calibrates: bool = True) -> None:
     """Raise InputError if memory does not hold a rendering or, if it `calibrates`, H with its uncertainty."""
-    scene, camera, world = setup.scene, setup.calibrated.camera, setup.world.camera
+    camera, world = setup.calibrated.camera, setup.world.camera
     rendering = SENSOR * camera.measurements + TARGET * world.unknowns
     check_memory(rendering, "rendering", "make target.shape or the lens arrays smaller")
     if not calibrates or setup.is_applied:
         return
-    check_entries(camera, camera.types, scene.calibration.method)
+    check_entries(setup.calibrated, camera.types)
 
 
 def check_lenses(camera: Camera) -> None:
@@ -67,16 +67,16 @@ def check_lenses(camera: Camera) -> None:
                     field(camera, sub, pose)
 
 
-def check_entries(camera: Camera, types: Iterable[LensType], method: str, why: str = "") -> None:
+def check_entries(setup: Setup, types: Iterable[LensType], why: str = "") -> None:
     """Raise InputError if memory does not hold H of some lens types with the uncertainty of its entries.
 
-    method : of the calibration;  why : H has entries
+    setup : on the grid of H's columns;  why : H has entries
     """
-    swept = method == "points" and camera.is_ideal_pinhole
+    camera = setup.camera
     entries = [lens.measurements * min(_visible_pixels(camera, lens), camera.unknowns) for lens in types]
-    needed = ENTRY * sum(entries) + (SWEPT * max(entries, default=0) if swept else 0)
+    needed = ENTRY * sum(entries) + (SWEPT * max(entries, default=0) if setup.renders_points else 0)
     remedy = "crop the target or use fewer sub-imagers"
-    if method != "ideal" and camera.is_applied:
+    if setup.scene.calibration.method != "ideal" and camera.is_applied:
         remedy = f"set calibration.method to 'ideal', whose kernels need no entries, or {remedy}"
     check_memory(needed, f"{why}H of {camera.measurements} x {camera.unknowns}", remedy)
 

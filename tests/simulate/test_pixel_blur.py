@@ -30,12 +30,12 @@ from .test_fill_factor import LENS, OPTICS, ROOM, SHAPE, SLOW, Part
 BLUR = {"pixel_blur": "2 um"}  # of pixels of 6 um
 
 
-def blurred(name: str, part: Part = "1", detail: int = 1, **tables: Any) -> tuple[Scene, Camera]:
+def blurred(name: str, part: Part = "1", detail: int = 1, distance: str = "1 m", **tables: Any) -> tuple[Scene, Camera]:
     """A camera whose pixels blur, on the grid of H's columns."""
     lens, table = OPTICS[name]
     optics = ROOM | table | BLUR | {"fill_factor": part}
     data = with_optics(lens, optics, LENS, SHAPE, **tables)[0].plain()
-    data["target"]["detail"] = detail
+    data["target"] |= {"detail": detail, "distance": distance}
     described = parse(data, Path("test.toml"))
     return described, derive(described).with_grid_of_matrix
 
@@ -116,10 +116,15 @@ def test_kernels_are_the_entries(name: str) -> None:
     assert np.abs(kernels - exact).max() < 4e-3 * exact.max()
 
 
-def test_readings_are_those_of_the_closed_form() -> None:
-    """Rendered until the variance is a tenth of the noise's: it is the one that is stated, or less."""
+@pytest.mark.parametrize("distance", ["1 m", "20 mm"])
+def test_readings_are_those_of_the_closed_form(distance: str) -> None:
+    """Rendered until the variance is a tenth of the noise's: it is the one that is stated, or less.
+
+    Light behind a pinhole has the same weight from everywhere, also at the angles of a target that is near.
+    """
     needs("llvm_ad_mono")
-    described, camera = blurred("pinholes", noise={"variance": 1e-2}, render={"samples": "auto"})
+    tables: dict[str, Any] = {"noise": {"variance": 1e-2}, "render": {"samples": "auto"}}
+    described, camera = blurred("pinholes", distance=distance, **tables)
     setup = Setup.from_scene(described)
     rendering = render_until(setup)
     errors = rendering.mean - ideal_matrix(camera) @ setup.image.ravel()

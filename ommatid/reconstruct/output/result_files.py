@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -162,7 +163,8 @@ def _read_results(folder: Path) -> tuple[RunReport, str | None]:
 def _is_whole(picture: Path) -> bool:
     """Return True if a PNG file has its end: a copy that was cut short has none."""
     with open_input(picture) as stream:
-        return stream.read().endswith(PNG_END)
+        stream.seek(-len(PNG_END), os.SEEK_END)
+        return stream.read() == PNG_END
 
 
 def region_reports(outcome: Reconstruction, regions: Sequence[Region]) -> dict[str, Any]:

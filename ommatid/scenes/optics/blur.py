@@ -32,20 +32,12 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import check_memory
 
 from ..camera import Camera
+from ..constants import DEVIATIONS
 from ..fitted.kernel_shapes import KernelShapes
 from ..fitted.kernels import KernelFootprints, KernelPlaces
 from ..lens_type import LensType
 from .diffraction import MOST_WAVES, Pattern, end_of, pattern
-from .radial_density import (
-    DEVIATIONS,
-    RadialDensity,
-    diffused,
-    disk_density,
-    disk_slant,
-    gaussian_density,
-    moments,
-    slopes,
-)
+from .radial_density import RadialDensity, diffused, disk_density, disk_slant, gaussian_density, moments, slopes
 
 MOST_REACH = 1000  # pixels of f
 MOST_WEIGHT = 1.0  # of f/0.5; beyond, the first order in the height of a pixel does not describe the cos^4 law

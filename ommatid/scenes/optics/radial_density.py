@@ -16,7 +16,8 @@ from scipy.special import i0e
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 
-DEVIATIONS = 5.0  # of a Gaussian displacement; 4e-6 of it is longer
+from ..constants import DEVIATIONS
+
 PANEL = 2.5  # standard deviations, at most, of a panel of what has a Gaussian displacement
 NODES = 24  # per panel, over which the argument of a diffraction pattern grows by 4; the error is below J_24(4), 1e-17
 

@@ -41,14 +41,11 @@ def rendered_model(
     scene, camera, start = setup.scene, setup.camera, perf_counter()
     record = dict[str, Any](method=scene.calibration.method)
 
-    # Point sources behind other lenses need as many renderings as the widest footprint has pixels, for the same H.
-    by_points = scene.calibration.method == "points" and setup.simulated.is_ideal_pinhole
-
     def measure(subsets: Subsets | None) -> Responses:
         if setup.is_applied:  # then no memory was asked for entries
             whole = [lens for lens in camera.types if subsets is None or _is_whole(subsets, lens)]
-            check_entries(camera, whole, scene.calibration.method, "few numbers do not explain all of H: ")
-        if by_points:
+            check_entries(setup, whole, "few numbers do not explain all of H: ")
+        if setup.renders_points:
             responses = responses_from_points(setup, progress, checkpoint, plans, subsets)
         else:
             from .ray_transport import responses_from_rays

@@ -19,14 +19,14 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import DEVIATIONS
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, basis, terms
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.radial_density import DEVIATIONS
 
 from .field import LensField, bands, check_waves, field_of
 from .point_spread import point_spread
-from .surface_matrix import blur_of, diffused, overlaps
+from .surface_matrix import blur_of, overlaps, row_by_waves
 
 CHARTS = {3: (2, 4), 5: (6,), 7: (8, 10), 12: (12, 14, 16)}  # nodes along a side of a quadrant, degrees for them
 HIGHEST = 16
@@ -78,12 +78,7 @@ class _FieldRows:
                 total += (down * (share * wave.light)[:, None]).T @ beside
             return total
         spread = point_spread(field.lit_wave(height).turned(angle), field.grid)
-        cell = spread.cell / camera.target_pitch
-        sides = np.ptp(edges, axis=1) / cell
-        values = diffused(spread.values, (blur[0] * sides[0], blur[1] * sides[1]))
-        offsets = cell * (np.arange(len(values), dtype=np.float64) - len(values) // 2)
-        down, across = (overlaps(each, -offsets, wide, cell) for each in edges)
-        return np.asarray(down.T @ values @ across, dtype=np.float64)
+        return row_by_waves(spread.values, spread.cell / camera.target_pitch, tuple(edges), blur, (wide, wide))
 
     def chart(self, nodes: FloatArray, *, ends: bool) -> tuple[FloatArray, FloatArray]:
         """Return pairs of u and v in a quadrant, (pairs, 2), and the rows there, (pairs, W^2).

@@ -14,7 +14,7 @@ point-spread functions are convolved on their grid. Its deviation is in proporti
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import groupby
@@ -27,8 +27,8 @@ from scipy.special import ndtr, sici
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.constants import DEVIATIONS
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.radial_density import DEVIATIONS
 from ommatid.scenes.pose import corner_offset, pose_of
 
 from .field import LensField, bands, check_waves, field_of
@@ -147,17 +147,13 @@ def _by_waves(
     for (turn, level), members in groupby(sorted(keys, key=keys.__getitem__), key=keys.__getitem__):
         if turn != before:
             spread_at, before = field.spreads(pi / 2 * turn / levels[1]), turn
-        sharp = spread_at(field.field * level / levels[0])
+        spread = spread_at(field.field * level / levels[0])
         for pixel in members:
             x, y = pixels.x[pixel], pixels.y[pixel]
-            turned = sharp.T if abs(x) > abs(y) else sharp
+            turned = spread.T if abs(x) > abs(y) else spread
             turned = turned[:: -1 if y < 0 else 1, :: -1 if x < 0 else 1]
-            sides = np.ptp(pixels.rows[pixel]) / cell, np.ptp(pixels.columns[pixel]) / cell
-            turned = diffused(turned, (pixels.blur[0] * sides[0], pixels.blur[1] * sides[1]))
-            offsets: FloatArray = cell * (np.arange(len(turned), dtype=np.float64) - len(turned) // 2)
-            down = overlaps(pixels.rows[pixel], -offsets, camera.rows, cell)
-            beside = overlaps(pixels.columns[pixel], -offsets, camera.columns, cell)
-            yield pixel, np.asarray(down.T @ turned @ beside, dtype=np.float64)
+            edges = pixels.rows[pixel], pixels.columns[pixel]
+            yield pixel, row_by_waves(turned, cell, edges, pixels.blur, camera.shape)
 
 
 def _key(field: LensField, x: float, y: float) -> tuple[int, int]:
@@ -189,10 +185,17 @@ def _integral(t: FloatArray, cell: float, deviation: float) -> FloatArray:
     return np.abs(t) / 2
 
 
-def diffused(spread: FloatArray, deviations: tuple[float, float]) -> FloatArray:
-    """Convolve a point-spread function, (n, n), with a Gaussian of standard deviations in cells: (n + k, n + k)."""
-    if not any(deviations):
-        return spread
-    more = ceil(DEVIATIONS * max(deviations))
-    moved = fft.fft2(np.pad(spread, more))
-    return np.asarray(fft.ifft2(ndimage.fourier_gaussian(moved, deviations)).real, dtype=np.float64)
+def row_by_waves(
+    spread: FloatArray, cell: float, edges: Sequence[FloatArray], blur: tuple[float, float], shape: tuple[int, int]
+) -> FloatArray:
+    """Return the entries, (rows, columns) of f, of a pixel with a point-spread function, (n, n) cells.
+
+    edges, blur : of its footprint, down and across, and its blur over these lengths;  shape : rows and columns
+    """
+    if any(blur):
+        deviations = [part * float(np.ptp(each)) / cell for part, each in zip(blur, edges, strict=True)]
+        moved = fft.fft2(np.pad(spread, ceil(DEVIATIONS * max(deviations))))
+        spread = fft.ifft2(ndimage.fourier_gaussian(moved, deviations)).real
+    offsets = cell * (np.arange(len(spread), dtype=np.float64) - len(spread) // 2)
+    down, beside = (overlaps(each, -offsets, size, cell) for each, size in zip(edges, shape, strict=True))
+    return np.asarray(down.T @ spread @ beside, dtype=np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -121,11 +122,10 @@ def read_estimate(path: Path) -> exr.Part:
 
 def write_picture(path: Path, estimate: FloatArray) -> None:
     """Write an estimate, (rows, columns), as 8-bit PNG, one pixel each; values outside 0 to 255 are clipped."""
-    from skimage import io
+    from PIL import Image
 
-    pixels = np.clip(np.round(estimate), 0, WHITE).astype(np.uint8)
-    imsave: Any = io.imsave  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-    write_whole(path, lambda beside: imsave(beside, pixels, check_contrast=False))
+    picture = Image.fromarray(np.clip(np.round(estimate), 0, WHITE).astype(np.uint8))
+    write_whole(path, partial(picture.save, format="PNG"))
 
 
 def write_results(folder: Path, stack: Stack, restoration: Reconstruction, report: RunReport) -> None:

@@ -1,7 +1,7 @@
-"""TIFF files: grey or RGB pages, uncompressed or compressed with Deflate or PackBits.
+"""TIFF files: grey or RGB pages, uncompressed or compressed with LZW, Deflate or PackBits.
 
 Pages are asked for one by one, since tifffile follows a circular list of them without end, and the sizes of all strips
-and tiles are checked before tifffile inflates them, which it does without a limit. What a file says of its pages in its
+and tiles are checked before tifffile reads them, since it fills what is missing. What a file says of its pages in its
 descriptions (OME, ImageJ) is not used: such texts may name other files.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import logging
 import re
-import zlib
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from math import prod
@@ -27,11 +26,12 @@ from .stored_picture import BYTES, UPRIGHT, StoredPicture, check_single, profile
 
 CHANNELS = {"MINISBLACK": 1, "RGB": 3}  # of light, by the kind of picture
 BITS = (1, 8, 16, 32, 64)  # per number
-UNCOMPRESSED, DEFLATE, PACKBITS = 1, (8, 32946), 32773
-PREDICTORS = (1, 2)  # none, differences along a row
+UNCOMPRESSED = 1
+DECODERS = {5: "lzw_decode", 8: "zlib_decode", 32946: "zlib_decode", 32773: "packbits_decode"}  # of imagecodecs
+EXPANSION = 4096  # most bytes that one byte stands for, with any of them
+PREDICTORS = (1, 2, 3)  # none, differences along a row, of the bytes of floating-point numbers
 MOST_PAGES = 100_000
 PLAIN = {"is_lsm": False, "is_scanimage": False, "is_ndpi": False}  # variants whose pages tifffile arranges itself
-STEP = 1 << 20  # bytes that are inflated at once to measure them
 
 
 def picture(stream: BinaryIO, path: Path) -> StoredPicture:
@@ -125,12 +125,12 @@ def _check_kind(path: Path, page: Any) -> None:
     colours, bits = int(page.samplesperpixel) - len(page.extrasamples), page.bitspersample
     compression = getattr(page.compression, "name", page.compression)
     is_known = not name or CHANNELS.get(name) == colours
-    is_packed = page.compression in (UNCOMPRESSED, *DEFLATE, PACKBITS) and page.predictor in PREDICTORS
+    is_packed = page.compression in (UNCOMPRESSED, *DECODERS) and page.predictor in PREDICTORS
     if not is_known or not is_packed or bits not in BITS or page.dtype is None:
         raise InputError(
             f"{path}: expected grey or RGB, got {colours} numbers per pixel of the kind {name}, {str(bits)[:20]} bits"
             f" each, compression {compression}, predictor {int(page.predictor)}; save it as one of"
-            " these, with 8, 16 or 32 bits per number, uncompressed or with Deflate"
+            " these, with 8, 16 or 32 bits per number, uncompressed or with LZW or Deflate"
         )
     if page.ndim > 3 or not prod(page.shape):
         raise ValueError(f"its shape is {page.shape}")
@@ -151,45 +151,24 @@ def _segment(page: Any) -> int:
 
 def _check_segments(stream: BinaryIO, page: Any) -> None:
     """Raise ValueError if strips or tiles are missing, outside the file, or inflate to more than belongs to them."""
+    import imagecodecs
+
     size, stored = stream.seek(0, io.SEEK_END), 0
     offsets, counts = list(page.dataoffsets), list(page.databytecounts)
-    expected = _segment(page) + STEP  # some encoders pad the last one
+    most = _segment(page)
     if len(offsets) != len(counts) or len(offsets) < prod(page.chunked):
         raise ValueError("some of its strips are missing")
+    decode: Any = None if page.compression == UNCOMPRESSED else getattr(imagecodecs, DECODERS[page.compression])
     for offset, count in zip(offsets, counts, strict=True):
         if offset + count > size:
             raise ValueError("it is cut short")
-        if page.compression == UNCOMPRESSED:
-            stored += count
-            continue
         stream.seek(offset)
-        length = _inflated if page.compression in DEFLATE else _unpacked
-        stored += length(stream.read(count), expected)
+        length = count if decode is None else len(decode(stream.read(count), out=min(most, EXPANSION * count) + 1))
+        if decode is not None and length > most:
+            raise ValueError("a strip has more than its pixels")
+        stored += length
     if 8 * stored < prod(page.shape) * page.bitspersample:
         raise ValueError("it is cut short")
-
-
-def _inflated(deflated: bytes, most: int) -> int:
-    """Return the length of an inflated strip, which is inflated in steps. Raises ValueError if it exceeds `most`."""
-    inflate, length = zlib.decompressobj(), 0
-    while deflated and not inflate.eof:
-        length += len(inflate.decompress(deflated, STEP))
-        deflated = inflate.unconsumed_tail
-        if length > most:
-            raise ValueError("a strip inflates to more than its pixels")
-    return length
-
-
-def _unpacked(packed: bytes, most: int) -> int:
-    """Return the length of an unpacked strip of PackBits. Raises ValueError if it exceeds `most`."""
-    index = length = 0
-    while index < len(packed) and length <= most:
-        head = packed[index]
-        length += head + 1 if head < 128 else 257 - head if head > 128 else 0
-        index += head + 2 if head < 128 else 2 if head > 128 else 1
-    if length > most:
-        raise ValueError("a strip has more than its pixels")
-    return length
 
 
 def _page(page: Any) -> StoredPicture:

@@ -193,7 +193,11 @@ def tiff(rng: Random, _: bytes) -> bytes:
     ) as writer:
         for _page in range(pages):
             extra = [(274, "H", 1, turned, True)] if turned else []
-            writer.write(stored, photometric=photometric, extratags=extra, contiguous=False, metadata=None)
+            options: dict[str, Any] = {
+                "compression": rng.choice((None, None, "lzw", "zlib", "packbits")),
+                "metadata": None,
+            }
+            writer.write(stored, photometric=photometric, extratags=extra, contiguous=False, **options)
     largest = 65535 if kind == "u2" else 255
     seen = largest - values if inverted else values
     pixels = NEVER if pages > 1 else _luminance(oriented(seen, turned), largest)

@@ -24,7 +24,7 @@ and t where the noise is fitted, on one that is refined where the evidence is.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from math import ceil, exp, log
 from typing import NamedTuple
@@ -415,17 +415,22 @@ def fit_prior(task: EstimationTask, *, prior_known: bool = False, noise_known: b
             " give prior.kind and estimator.noise_variance"
         )
     if noise_known:
-        fit = _fit(task, places, task.expected_noise, prior_known=prior_known, noise_known=True)
+        measured = _Measured.of(task, places, task.expected_noise, prior_known=prior_known)
+        fit = measured.fit(noise_known=True)
         overview = None if prior_known or len(places) == 1 else _PartMeans.of(task)
         if overview is None or fit.prior is None or overview.excess(fit.prior) <= MOST_EXCESS:
             return fit
-        return _fit(task, places, task.expected_noise, prior_known=False, noise_known=True, beside=[overview])
+        return measured.beside(overview).fit(noise_known=True)
     # A multiple of the whole noise is fitted, whose distribution over the measurements is uniform at first.
     known = task.expected_noise
-    fit = _fit(task, places, known + (UNIFORM * float(known.max()) or 1.0), prior_known=prior_known, noise_known=False)
+
+    def fitted(unknown: float) -> PriorFit:
+        return _Measured.of(task, places, known + unknown, prior_known=prior_known).fit(noise_known=False)
+
+    fit = fitted(UNIFORM * float(known.max()) or 1.0)
     for _ in range(ROUNDS if np.ptp(known) else 0):
         before = fit.noise_variance or LEAST_NOISE * float(known.mean())
-        fit = _fit(task, places, known + before, prior_known=prior_known, noise_known=False)
+        fit = fitted(before)
         if abs((fit.noise_variance or 0.0) - before) < CONVERGED * before:
             break
     return fit
@@ -444,15 +449,16 @@ def fit_picture(picture: FloatArray, detail: int, pitch: float, table: PriorTabl
     if not any(window.image.any() for window in windows):
         return None
 
-    def fitted(*beside: _PartMeans) -> FittedPrior:
-        posteriors, shares, _, _ = _posteriors([*windows, *beside], spectra, prior_known=False, noise_known=True)
+    def fitted(evidence: list[list[Evidence]]) -> FittedPrior:
+        posteriors, shares, _, _ = _posteriors(evidence, spectra, prior_known=False, noise_known=True)
         return _mean_prior(table, spectra, posteriors, shares)
 
-    prior, side = fitted(), detail * max(min(picture.shape) // detail // PARTS, 1)
+    evidence = _evidence(windows, spectra)
+    prior, side = fitted(evidence), detail * max(min(picture.shape) // detail // PARTS, 1)
     if len(windows) == 1 or min(picture.shape) < FEWEST_PARTS * side:
         return prior
     overview = _PartMeans(means_over(picture, side) - table.mean, table.level_deviation, ROUNDING, side, pitch / detail)
-    return prior if overview.excess(prior) <= MOST_EXCESS else fitted(overview)
+    return prior if overview.excess(prior) <= MOST_EXCESS else fitted(_with(evidence, overview, spectra))
 
 
 def natural_prior(table: PriorTable, pitch: float) -> FittedPrior:
@@ -463,47 +469,73 @@ def natural_prior(table: PriorTable, pitch: float) -> FittedPrior:
     return FittedPrior.of(table, (one._replace(density=density),), table.variance)
 
 
-def _fit(
-    task: EstimationTask,
-    places: list[Place],
-    noise: FloatArray,
-    *,
-    prior_known: bool,
-    noise_known: bool,
-    beside: Sequence[_PartMeans] = (),
-) -> PriorFit:
-    """Return the fit of the prior, and of a multiple of `noise`, (measurements used,).
+@dataclass(frozen=True)
+class _Measured:
+    """What windows of a task say of each spectrum.
 
-    beside : means over parts that count beside the windows
+    noise : (measurements used,), of which a multiple is fitted where it is not known
+    spectra, evidence : for each of them the evidence of all windows;  prior_known : True for the task's own spectrum
     """
-    windows = [*(place.window(task, noise) for place in places if place.numbers.size), *beside]
-    shape, pitch = places[0].shape, task.model.camera.target_pitch
-    spectra = [_known(task, shape)] if prior_known else _spectra(shape, pitch, _detail(task))
-    posteriors, shares, at_end, flat = _posteriors(windows, spectra, prior_known=prior_known, noise_known=noise_known)
-    multiple = float(shares @ [each.means[1] for each in posteriors])
-    # Known noise and a variance n have multiples of the whole noise whose mean is 1 + (n - the last n) mean(1 / noise).
-    noise_variance = float(noise[0] - task.expected_noise[0]) + (multiple - 1) / float(np.mean(1 / noise))
-    numbers = {} if prior_known else _numbers_of(spectra, posteriors, shares)
-    if not noise_known:
-        numbers["noise_variance"] = noise_variance, _moments(shares, [each.moments[1] for each in posteriors])[1]
-    return PriorFit(
-        prior=None if prior_known else _mean_prior(task.prior, spectra, posteriors, shares),
-        noise_variance=None if noise_known else max(noise_variance, 0.0),
-        numbers=numbers,
-        measurements=sum(place.numbers.size for place in places),
-        doubtful=at_end and not flat if noise_known else at_end or flat or noise_variance < 0,
-        flat=noise_known and flat,
-    )
+
+    task: EstimationTask
+    noise: FloatArray
+    measurements: int
+    spectra: list[NaturalSpectrum]
+    evidence: list[list[Evidence]]
+    prior_known: bool
+
+    @classmethod
+    def of(cls, task: EstimationTask, places: list[Place], noise: FloatArray, *, prior_known: bool) -> _Measured:
+        """Take the measurements of places."""
+        windows = [place.window(task, noise) for place in places if place.numbers.size]
+        shape, pitch = places[0].shape, task.model.camera.target_pitch
+        spectra = [_known(task, shape)] if prior_known else _spectra(shape, pitch, _detail(task))
+        count = sum(place.numbers.size for place in places)
+        return cls(task, noise, count, spectra, _evidence(windows, spectra), prior_known)
+
+    def beside(self, means: _PartMeans) -> _Measured:
+        """Count means over parts of the image, too."""
+        return replace(self, evidence=_with(self.evidence, means, self.spectra))
+
+    def fit(self, *, noise_known: bool) -> PriorFit:
+        """Return the fit of the prior, and of a multiple of the noise."""
+        posteriors, shares, at_end, flat = _posteriors(
+            self.evidence, self.spectra, prior_known=self.prior_known, noise_known=noise_known
+        )
+        multiple = float(shares @ [each.means[1] for each in posteriors])
+        # Known noise and a variance n have multiples of the whole whose mean is 1 + (n - the last n) mean(1 / noise).
+        last = float(self.noise[0] - self.task.expected_noise[0])
+        noise_variance = last + (multiple - 1) / float(np.mean(1 / self.noise))
+        numbers = {} if self.prior_known else _numbers_of(self.spectra, posteriors, shares)
+        if not noise_known:
+            numbers["noise_variance"] = noise_variance, _moments(shares, [each.moments[1] for each in posteriors])[1]
+        return PriorFit(
+            prior=None if self.prior_known else _mean_prior(self.task.prior, self.spectra, posteriors, shares),
+            noise_variance=None if noise_known else max(noise_variance, 0.0),
+            numbers=numbers,
+            measurements=self.measurements,
+            doubtful=at_end and not flat if noise_known else at_end or flat or noise_variance < 0,
+            flat=noise_known and flat,
+        )
+
+
+def _evidence(windows: Sequence[Window | _Picture], spectra: list[NaturalSpectrum]) -> list[list[Evidence]]:
+    """Return for every spectrum the evidence of all windows."""
+    return [[window.evidence(spectrum) for window in windows] for spectrum in spectra]
+
+
+def _with(evidence: list[list[Evidence]], means: _PartMeans, spectra: list[NaturalSpectrum]) -> list[list[Evidence]]:
+    """Return for every spectrum the evidence of all windows and of means over parts."""
+    return [[*each, means.evidence(spectrum)] for each, spectrum in zip(evidence, spectra, strict=True)]
 
 
 def _posteriors(
-    windows: Sequence[Window | _Picture], spectra: list[NaturalSpectrum], *, prior_known: bool, noise_known: bool
+    every: list[list[Evidence]], spectra: list[NaturalSpectrum], *, prior_known: bool, noise_known: bool
 ) -> tuple[list[ScalePosterior], FloatArray, bool, bool]:
     """Return the posterior for every spectrum, and its share of the evidence.
 
     Then whether a number lies at the end of its range, and whether noise alone explains the measurements.
     """
-    every = [[window.evidence(spectrum) for window in windows] for spectrum in spectra]
     fixed, square = np.zeros(1), float(np.mean(np.concatenate([part.residual for part in every[0]]) ** 2))
     noises = fixed if noise_known else log(square) + np.arange(-2 * REACH, 3 * COARSE, COARSE)
     nothing = float(np.sum([part.log(fixed, np.exp(noises)) for part in every[0]], axis=0).max())

@@ -14,12 +14,13 @@ import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import expm1, log1p
 from pathlib import Path
 from time import perf_counter
 from typing import Any, cast
 
 import numpy as np
-from scipy import ndimage, optimize, sparse, stats
+from scipy import ndimage, optimize, sparse, special
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError, named, shortened
@@ -398,7 +399,7 @@ def _median(values: FloatArray, used: BoolArray) -> FloatArray:
 
 def _score(count: int) -> float:
     """Standard deviations that one of `count` normal deviates exceeds with the probability CHANCE (Sidak)."""
-    return float(cast(Any, stats).norm.isf(-np.expm1(np.log1p(-CHANCE) / max(count, 1))))
+    return -float(special.ndtri(-expm1(log1p(-CHANCE) / max(count, 1))))
 
 
 def _entries(unknown: IntArray, readings: FloatArray, unknowns: int) -> RecordedEntries:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.scenes.fitted.kernels import basis, terms
@@ -116,7 +116,7 @@ def chance(products: FloatArray) -> float:
     if trace <= 0:
         return 1.0
     ratio = float(products[0, 0]) / (trace / (free + 1))
-    return float(stats.f.sf(ratio, freedom, freedom * free))
+    return float(special.fdtrc(freedom, freedom * free, ratio))
 
 
 def excess(products: FloatArray) -> float:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import sparse, stats
+from scipy import sparse, special
 
 from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
@@ -52,7 +52,7 @@ class Explanation:
         """Probability of a sum of squares at least as large if the model is correct; 0 where nothing was measured."""
         if not self.expected:
             return 0.0
-        return float(stats.f.sf(self.left / self.expected, self.freedom, self.freedom * (self.batches - 1)))
+        return float(special.fdtrc(self.freedom, self.freedom * (self.batches - 1), self.left / self.expected))
 
 
 def explanation(chart: ChartRows, model: FloatArray, rays: int, recorded: bool = False) -> Explanation:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse, stats
+from scipy import sparse, special
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.scenes.camera import Camera
@@ -408,7 +408,7 @@ def _chance(solution: ViewSolution, numbers: tuple[int, ...], kind: str) -> floa
             values, variance = values[:1], np.array([common])
         squares += float((np.square(values) / variance).sum())
         freedom += values.size
-    return float(stats.f.sf(squares / freedom, freedom, solution.freedom)) if freedom else 1.0
+    return float(special.fdtrc(freedom, solution.freedom, squares / freedom)) if freedom else 1.0
 
 
 NAMES = ("row", "column", "magnification", "rotation", "k1")

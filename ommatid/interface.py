@@ -8,14 +8,13 @@ refuses raises MachineError; both say in one sentence what was expected, what ca
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from ommatid.batch.remote import RunObserver
+from ommatid.batch.remote import SILENT
 from ommatid.pipeline import stages
 from ommatid.reconstruct.output import result_files
 from ommatid.reconstruct.output.run_json import HeldOutReport
@@ -192,7 +191,7 @@ def run(scene: Scene | str | Path, folder: str | Path) -> Result:
     """
     setup = _setup(scene)
     with occupied(Path(folder), "stack.exr"):
-        stages.run(setup, Path(folder), RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None))
+        stages.run(setup, Path(folder), SILENT)
     return read_result(folder)
 
 

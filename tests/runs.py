@@ -79,6 +79,7 @@ def content(folder: Path) -> dict[str, Any]:
     for path in folder.glob("*.exr"):
         for part in exr.read(path):
             record = {**part.record, "record": without_times(part.record.get("record", {}))}
+            record |= {"report": numbers(record["report"])} if "report" in record else {}
             found[f"{path.name}/{part.name}"] = without_times(record)
             found |= {f"{path.name}/{part.name}/{name}": pixels.tobytes() for name, pixels in part.channels.items()}
     with np.load(folder / "model.npz", allow_pickle=False) as file:

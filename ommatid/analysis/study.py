@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 
 from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.output.run_json import Record, StudyCase
+from ommatid.reconstruct.output.run_json import Amount, Record, StudyCase
 from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
@@ -41,6 +42,7 @@ class StudyFile(Record):
     """The content of study.json."""
 
     fingerprint: str
+    seconds: Amount
     cases: tuple[StudyCase, ...]
 
 
@@ -82,19 +84,19 @@ def cached_study(
     models: Mapping[StudyModel, Callable[[], Model]],
     truth: FloatArray | None,
     progress: Progress = no_progress,
-) -> tuple[tuple[StudyCase, ...], bool]:
-    """Return the cases of a study, and True if they had to be computed; writes study.json and study.csv.
+) -> tuple[StudyFile, bool]:
+    """Return the cases of a study and True if they had to be computed; writes study.json and study.csv.
 
     models : by name, made only where they are needed
     """
     current = fingerprint([list(models), stack.record, stack.scene.plain(), truth is not None])
 
     def make() -> StudyFile:
-        cases: list[StudyCase] = []
+        begun, cases = perf_counter(), list[StudyCase]()
         for name, model in models.items():
             cases.append(study_case(stack, name, model(), truth))
             progress(len(cases) / len(models))
-        return StudyFile(fingerprint=current, cases=tuple(cases))
+        return StudyFile(fingerprint=current, seconds=perf_counter() - begun, cases=tuple(cases))
 
     def write(folder: Path, study: StudyFile) -> None:
         columns = list(StudyCase.model_fields)
@@ -110,10 +112,10 @@ def remove_study(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def _read_study(folder: Path) -> tuple[tuple[StudyCase, ...], str | None]:
-    """Return the cases in study.json, and its fingerprint if study.csv is there too."""
+def _read_study(folder: Path) -> tuple[StudyFile, str | None]:
+    """Return study.json, and its fingerprint if study.csv is there too."""
     study: StudyFile = read_record(folder / NUMBERS, StudyFile, "a study", "run the scene again")
-    return study.cases, study.fingerprint if (folder / TABLE).is_file() else None
+    return study, study.fingerprint if (folder / TABLE).is_file() else None
 
 
 def rows(cases: Sequence[StudyCase]) -> list[tuple[str, str]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from ommatid.runtime.machine import processors
 from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_output
 from ommatid.runtime.outputs.occupied import new_folder, occupied
 from ommatid.scenes.formats.picture import write_truth
-from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, write
+from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, Scene, read, write
 from ommatid.scenes.setup import Setup
 
 from .remote import RunObserver, SceneOutcome, ScenePackage, Stages, carry_out, outcome_of, packed, unpack
@@ -47,11 +47,21 @@ Check = Callable[[Setup, Path], None]  # raises InputError where the stages woul
 
 @dataclass(frozen=True)
 class Member:
-    """A scene file of a batch, the changes to it (KEY=VALUE), and the folder of its results."""
+    """A scene file of a batch, and the folder of its results.
+
+    changes : KEY=VALUE of a sweep, after those `common` to all scenes;  lenses : that are kept, none for all
+    """
 
     scene: Path
     folder: Path
     changes: tuple[str, ...] = ()
+    common: tuple[str, ...] = ()
+    lenses: tuple[str, ...] = ()
+
+    @cached_property
+    def content(self) -> Scene:
+        """Read and check the scene, once. Raises InputError."""
+        return read(self.scene, (*self.common, *self.changes), self.lenses)
 
     @property
     def values(self) -> dict[str, str]:

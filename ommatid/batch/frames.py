@@ -33,7 +33,6 @@ from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import origin
 from ommatid.scenes import model_file
 from ommatid.scenes import stack as stack_file
-from ommatid.scenes.formats import exr
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, WORLD_PICTURE
 from ommatid.scenes.stack import Stack
@@ -84,9 +83,9 @@ class Frame:
     def finished(self) -> RunReport | None:
         """Return the report of an estimate that is there and up to date, else None."""
         with suppress(OSError, ValueError, KeyError, TypeError, InputError):
-            record = exr.read(self.output)[0].record
-            if record["fingerprint"] == self.fingerprint and self.output.with_suffix(".png").is_file():
-                return RunReport.model_validate(record["report"])
+            report = result_files.read_report(self.output)
+            if report.fingerprint == self.fingerprint and self.output.with_suffix(".png").is_file():
+                return report
         return None
 
 
@@ -213,8 +212,7 @@ def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunR
     report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
     clear_formats(frame.output)
     result_files.write_picture(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
-    record = {"title": stack.scene.title, "fingerprint": frame.fingerprint, "report": report.plain()}
-    result_files.write_estimate(frame.output, outcome, record)
+    result_files.write_estimate(frame.output, outcome, result_files.record_of(report))
     write_formats(frame.output, options.formats)
     return report, True
 

@@ -15,12 +15,10 @@ from typing import Any
 from ommatid.analysis import summary
 from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY, allowed_memory, choose_method
-from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.result_files import fingerprint_of
+from ommatid.reconstruct.output.result_files import ESTIMATE, fingerprint_of, read_report
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
-from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import IN_PLACE_OF_AUTO
 from ommatid.simulate import calibrate, render
@@ -40,9 +38,7 @@ START = 2.0  # seconds to start a process
 PARALLEL = 0.6  # fraction of a scene's work that uses all processors; the rest uses one (Amdahl)
 
 
-def plan(
-    member: Member, setup: Setup, changes: Sequence[str], lenses: Sequence[str], force: bool = False
-) -> dict[str, Any]:
+def plan(member: Member, setup: Setup, force: bool = False) -> dict[str, Any]:
     """Describe what a run of a scene would do, in JSON's types.
 
     Each stage has a `state`, "to be made" or "up to date"; `seconds` and `memory` (bytes) are those of a run from the
@@ -54,7 +50,7 @@ def plan(
     choice = choose_method(setup.scene, setup.camera, setup.is_applied)
     described = summary.describe(setup, variant.choose(setup.scene.render.variant), choice)
     states = dict.fromkeys(STAGES, TO_MAKE) if force else _states(member.folder, setup)
-    cost = estimate_cost(member, changes, lenses)
+    cost = estimate_cost(member)
     return {
         "folder": str(member.folder),
         "title": setup.scene.title,
@@ -92,7 +88,7 @@ def _states(folder: Path, setup: Setup) -> dict[str, str]:
             return states
         states["calibrate"] = CURRENT
         if recorded.scene.plain() == setup.resolved.plain():
-            same = run_json.read(folder).fingerprint == fingerprint_of(recorded, model)
+            same = read_report(folder / ESTIMATE).fingerprint == fingerprint_of(recorded, model)
             states["reconstruct"] = CURRENT if same else TO_MAKE
     return states
 
@@ -105,10 +101,10 @@ class CostEstimate:
     memory: int
 
 
-def estimate_cost(member: Member, changes: Sequence[str], lenses: Sequence[str]) -> CostEstimate:
+def estimate_cost(member: Member) -> CostEstimate:
     """Estimate the cost of a scene of a batch; 0 for one with errors, which are reported when it is run."""
     try:
-        setup = Setup.from_scene(read(member.scene, (*changes, *member.changes), lenses))
+        setup = Setup.from_scene(member.content)
         choice = choose_method(setup.scene, setup.camera, setup.is_applied)
     except InputError:
         return CostEstimate(0.0, 0)

@@ -42,6 +42,7 @@ class RunObserver:
     start_up: Callable[[], float] | None = None
 
 
+SILENT = RunObserver(lambda _: nullcontext(no_progress), lambda _stage, _made: None)
 Stages = Callable[[Setup, Path, RunObserver], dict[str, Any]]
 
 

@@ -59,7 +59,13 @@ def sweep_axes(options: Iterable[str]) -> tuple[SweepAxis, ...]:
     return tuple(axes)
 
 
-def members(scenes: Sequence[Path], axes: Sequence[SweepAxis], output: Path) -> list[Member]:
+def members(
+    scenes: Sequence[Path],
+    axes: Sequence[SweepAxis],
+    output: Path,
+    common: Sequence[str] = (),
+    lenses: Sequence[str] = (),
+) -> list[Member]:
     """List every scene with every combination of values, in folders of `output` that are named after them.
 
     Raises InputError if two of them would share a folder, for a scene with a name that no folder can have, and for more
@@ -78,7 +84,7 @@ def members(scenes: Sequence[Path], axes: Sequence[SweepAxis], output: Path) -> 
         if folder in by_folder:
             raise InputError(f"{folder}: two scenes of the batch are called '{scene.stem}'; rename one of them")
         changes = tuple(f"{axis.key}={value}" for axis, value in zip(axes, values, strict=True))
-        by_folder[folder] = Member(scene, folder, changes)
+        by_folder[folder] = Member(scene, folder, changes, tuple(common), tuple(lenses))
     return list(by_folder.values())
 
 
@@ -112,7 +118,7 @@ def check_keys(scene: Path, axes: Sequence[SweepAxis], changes: Sequence[str], l
 
     Other errors in the scene, and errors in values, are reported when the scene concerned is run.
     """
-    if _key_error(scene, changes, lenses, None):
+    if not axes or _key_error(scene, changes, lenses, None):
         return
     for axis in axes:
         error = _key_error(scene, (*changes, f"{axis.key}={axis.values[0]}"), lenses, axis.key)

@@ -1,4 +1,4 @@
-"""Convert every failure of a command into one sentence on stderr and an exit code.
+"""Convert the outcome of a command into an exit code, and every failure into one sentence on stderr.
 
 Exit codes are 0, 2 for a scene, option or file to correct, 1 for a failure of the machine, and 3 with --strict for
 results that are not to be trusted.
@@ -10,14 +10,17 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from ommatid.runtime.errors import InputError, MachineError, NotStartedError
 from ommatid.runtime.execution.library_warnings import TRACEBACK
 from ommatid.runtime.outputs.kinds import input_error
 from ommatid.runtime.printable import printable
 
-from .output import say
+from .output import print_result, say
+
+if TYPE_CHECKING:
+    from ommatid.pipeline.batches import BatchOutcome
 
 # Options that are no longer, with what takes their place.
 _TLS = "name the file in Dask's own configuration, as by DASK_DISTRIBUTED__COMM__TLS__"
@@ -38,6 +41,20 @@ class BatchError(Exception):
         """Stop a command with an exit code after its results and failures have been reported."""
         super().__init__(exit_code)
         self.exit_code = exit_code
+
+
+def finish_batch(outcome: BatchOutcome, as_json: bool, strict: bool = False, job_words: str = "") -> None:
+    """Print the documents of a batch, or the table of a sweep, and a sentence on the job that ran it, if any.
+
+    Raises BatchError if a scene failed or, if `strict`, if the results of one are not to be trusted.
+    """
+    print_result(outcome.documents, outcome.sections, as_json)
+    if job_words:
+        say(job_words)
+    verdicts = [document["verdict"]["trusted"] for document in outcome.documents if "verdict" in document]
+    code = max(outcome.exit_code, NOT_TRUSTED if strict and not all(verdicts) else 0)
+    if code:
+        raise BatchError(code)
 
 
 def exit_code_of(command: Callable[[], object]) -> int:

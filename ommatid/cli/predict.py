@@ -12,7 +12,6 @@ from ommatid.runtime.errors import InputError
 
 from . import failures, options, output
 from .options import SCREEN, FigureFormats, FigureResolution, Json, Lenses, SceneFile, Sets, Sweeps
-from .run import finish_batch
 
 if TYPE_CHECKING:
     from ommatid.figures.saving import FigureFiles
@@ -105,6 +104,6 @@ def _predict_sweep(
 
     members = batch_members([scene], Path(), sweep, changes, lenses)
     predicted = partial(stages.predict_scene, rays=rays)
-    batch = scene_batch(changes, lenses, predicted, output.observer, lambda _, description: description)
+    batch = scene_batch(predicted, output.observer, lambda _, description: description)
     outcome = run_batch(batch, members, failures.report, sweep_folder=folder, with_folders=False, figures=figures)
-    finish_batch(outcome, as_json)
+    failures.finish_batch(outcome, as_json)

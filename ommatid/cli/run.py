@@ -39,7 +39,6 @@ from .options import (
 
 if TYPE_CHECKING:
     from ommatid.batch.batch import Member
-    from ommatid.pipeline.batches import BatchOutcome
 
 STARTED = perf_counter()  # from which --within counts
 
@@ -77,18 +76,18 @@ def run(
     figures = figure_files(figure_formats, figure_resolution)
     asked = changes(sets, complete, allow_outside), lens_names(lens)
     members, job_words = share_of_job(job, batch_members(scenes, folder, sweep, *asked), scheduler)
-    output.warn_all(batch_warnings(members, *asked))
+    output.warn_all(batch_warnings(members))
     if dry_run:
-        _print_plans(members, *asked, force, as_json)
+        _print_plans(members, force, as_json)
         return
     stages, workers = stages_within(within, members, STARTED, output.warn, scheduler, workers)
     pool = cluster(scheduler), workers
     observer = partial(output.observer, alone=len(members) == 1, quiet=quiet)
     check = (check_within if within else check_run) if force else None
     stages, report = with_figures(stages, figures), partial(_print_run, None if as_json else detail)
-    batch = scene_batch(*asked, with_options(stages, check, others), observer, report)
+    batch = scene_batch(with_options(stages, check, others), observer, report)
     files: dict[str, Any] = {"sweep_folder": None if job else folder, "index_folder": folder, "figures": figures}
-    finish_batch(run_batch(batch, members, failures.report, *pool, **files), as_json, strict, job_words)
+    failures.finish_batch(run_batch(batch, members, failures.report, *pool, **files), as_json, strict, job_words)
 
 
 def _print_run(detail: output.Detail | None, member: Member, description: dict[str, Any]) -> dict[str, Any]:
@@ -105,14 +104,12 @@ def _print_run(detail: output.Detail | None, member: Member, description: dict[s
     return description
 
 
-def _print_plans(
-    members: Sequence[Member], asked: tuple[str, ...], lenses: tuple[str, ...], force: bool, as_json: bool
-) -> None:
+def _print_plans(members: Sequence[Member], force: bool, as_json: bool) -> None:
     """Print what a run would do. Raises InputError for the first scene that would fail."""
     from ommatid.batch import plan
     from ommatid.pipeline.stages import open_member
 
-    plans = [plan.plan(member, open_member(asked, lenses, member), asked, lenses, force) for member in members]
+    plans = [plan.plan(member, open_member(member), force) for member in members]
     if as_json:
         output.print_json(
             [{"scene": str(member.scene), **described} for member, described in zip(members, plans, strict=True)]
@@ -146,23 +143,9 @@ def render(
 
     asked = changes(sets, complete, allow_outside), lens_names(lens)
     members, job_words = share_of_job(job, batch_members(scenes, folder, sweep, *asked), scheduler)
-    output.warn_all(batch_warnings(members, *asked))
+    output.warn_all(batch_warnings(members))
     check = stages.check_render if force else None
-    batch = scene_batch(*asked, with_options(stages.render, check, ()), output.observer, report)
+    batch = scene_batch(with_options(stages.render, check, ()), output.observer, report)
     pool = cluster(scheduler), workers
     outcome = run_batch(batch, members, failures.report, *pool, sweep_folder=None if job else folder)
-    finish_batch(outcome, as_json, job_words=job_words)
-
-
-def finish_batch(outcome: BatchOutcome, as_json: bool, strict: bool = False, job_words: str = "") -> None:
-    """Print the documents of a batch, or the table of a sweep, and a sentence on the job that ran it, if any.
-
-    Raises BatchError if a scene failed or, if `strict`, if the results of one are not to be trusted.
-    """
-    output.print_result(outcome.documents, outcome.sections, as_json)
-    if job_words:
-        output.say(job_words)
-    verdicts = [document["verdict"]["trusted"] for document in outcome.documents if "verdict" in document]
-    code = max(outcome.exit_code, failures.NOT_TRUSTED if strict and not all(verdicts) else 0)
-    if code:
-        raise failures.BatchError(code)
+    failures.finish_batch(outcome, as_json, job_words=job_words)

@@ -5,17 +5,16 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING
 
 from ommatid.bench.table import bench_tables
-from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.run_json import PAGE, before_page, with_stage, without_page
+from ommatid.reconstruct.output.run_json import RunReport, of_stages
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.input_files import open_input
 from ommatid.scenes import stack
+from ommatid.scenes.model import Model
+from ommatid.scenes.stack import Stack
 
 from .data import read_run
 
@@ -28,31 +27,29 @@ DRAWN = HERE.parent / "analysis" / "quality", HERE.parent / "figures"  # folders
 HEAD, TAIL = 4096, 64  # bytes at the beginning of a page that contain its stamp, and at its end
 
 
-def cached_page(folder: Path, ideal: IdealMatrix | None) -> bool:
-    """Write report.html of a finished run unless it is up to date, and return True if it was written.
+def cached_page(
+    folder: Path,
+    report: RunReport,
+    ideal: IdealMatrix | None,
+    recorded: Stack | None = None,
+    calibrated: Model | None = None,
+) -> bool:
+    """Write report.html of a run unless it is up to date, and return True if it was written.
 
-    The time that the first page takes is added to run.json.
-
-    ideal : H of one sub-imager as designed
+    report : of the run, of which times of files and of the page do not count;  ideal : H of one sub-imager as designed
+    recorded, calibrated : the stack and the model in the folder, None to read them
     Raises InputError for missing or damaged files, MachineError for a full disk.
     """
-    recorded, report = stack.read(folder / "stack.exr"), run_json.read(folder)
+    report = of_stages(report)
+    recorded = stack.read(folder / "stack.exr") if recorded is None else recorded
     bench = next(bench_tables(folder, recorded.camera.describe()), None)
     described = None if bench is None else bench.describe()
-    stamp = fingerprint([without_page(report), described, sources_digest()])
+    stamp = fingerprint([report.plain(), described, sources_digest()])
 
     def make() -> str:
-        begun = perf_counter()
         from .sections import page
-        from .tables import with_page_time
 
-        run = read_run(folder, recorded)
-        html = page(replace(run, report=before_page(run.report)), ideal, bench, stamp)
-        if PAGE not in report.stages:  # a page that is made again is the same
-            stages = with_stage(report, PAGE, perf_counter() - begun)
-            run_json.write(folder, stages)
-            return with_page_time(html, stages.stages[PAGE].seconds)
-        return with_page_time(html, report.stages[PAGE].seconds)
+        return page(read_run(folder, report, recorded, calibrated), ideal, bench, stamp)
 
     return cached(folder / REPORT, stamp, read_stamp, make, write_text)[1]
 

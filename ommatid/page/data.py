@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ommatid.reconstruct.measured_error import best_single_sub_image, enlarged
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
-from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.reconstruct.output.run_json import RunReport, of_stages
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import real_path
@@ -74,10 +74,12 @@ class ResultMaps:
         return None if self.truth is None else self.estimate - self.truth
 
 
-def read_run(folder: Path, recorded: Stack | None = None, calibrated: Model | None = None) -> Run:
-    """Read the run in a folder; stack and model are read only if they are not given. Raises InputError."""
+def read_run(
+    folder: Path, report: RunReport | None = None, recorded: Stack | None = None, calibrated: Model | None = None
+) -> Run:
+    """Read the run in a folder: its maps, and what of it is not given. Raises InputError."""
     channels = read_estimate(folder / ESTIMATE).channels
-    report = run_json.read(folder)
+    report = run_json.read(folder) if report is None else report
     recorded = stack.read(folder / "stack.exr") if recorded is None else recorded
     shapes = {name: channels[name].shape for name in ("estimate", "variance") if name in channels}
     if shapes != dict.fromkeys(("estimate", "variance"), recorded.camera.shape):
@@ -101,7 +103,7 @@ def read_parts(folder: Path) -> dict[str, Any]:
     stack_path, model_path = folder / "stack.exr", folder / "model.npz"
     return {
         **(read_estimate(folder / ESTIMATE).channels if (folder / ESTIMATE).exists() else {}),
-        **({"report": run_json.read(folder)} if (folder / run_json.RUN).exists() else {}),
+        **({"report": of_stages(run_json.read(folder))} if (folder / run_json.RUN).exists() else {}),
         **({"stack": stack.read(stack_path)} if stack_path.exists() else {}),
         **({"model": model_file.read(model_path)} if model_path.exists() else {}),
     }

@@ -61,7 +61,7 @@ def page_of(folder: Path) -> str:
 
     parts = read_parts(folder)
     if {"report", "stack", "model", "estimate", "variance"} <= parts.keys():
-        run = read_run(folder, parts["stack"], parts["model"])
+        run = read_run(folder, parts["report"], parts["stack"], parts["model"])
         return page(run, partial(matrix_as_designed, run.stack.camera), None, run.report.fingerprint)
     if not {"stack", "model", "estimate"} & parts.keys():
         raise InputError(f"{folder}: expected stack.exr, model.npz or estimate.exr, got none; run a scene first")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ommatid.analysis import depth_error, run_table, study
 from ommatid.analysis.lens_table import lens_rows
 from ommatid.analysis.summary import describe, skipped_words
-from ommatid.reconstruct.output.run_json import FILES, PAGE, RunReport, StageReport
+from ommatid.reconstruct.output.run_json import RunReport, StageReport
 from ommatid.reconstruct.output.verdict_words import is_trusted
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.geometry.optical_terms import optical_terms
@@ -18,7 +18,6 @@ from ommatid.scenes.tables import toml
 
 from .data import Run
 
-PAGE_TIME = "seconds-of-the-page"
 NBSP = "\N{NO-BREAK SPACE}"
 
 
@@ -32,22 +31,17 @@ class PageTable:
 
 
 def stages(run: Run) -> PageTable:
-    """Return method and run time of every stage; PAGE_TIME stands for the time of the page, known once it is made."""
-    known = {name: stage for name, stage in run.report.stages.items() if name != PAGE}
+    """Return method and time of every stage."""
+    known = run.report.stages
     total = sum(stage.seconds for stage in known.values()) or 1.0
     rows = [
         (name, _method(name, stage, run), _seconds(stage.seconds), f"{100 * stage.seconds / total:.0f}{NBSP}%")
         for name, stage in known.items()
     ]
-    rows.append((PAGE, "this report", PAGE_TIME, ""))
-    if run.report.spent.start_up is not None:
-        rows.append(("start-up", "loading programs and the scene", _seconds(run.report.spent.start_up), ""))
     return PageTable("Stages of this run", ("stage", "method", "time", "share"), rows)
 
 
 def _method(name: str, stage: StageReport, run: Run) -> str:
-    if name == FILES:
-        return "reading, checking and writing files; pictures"
     words = [] if stage.method is None else [stage.method]
     if stage.samples is not None:
         words.append(run_table.samples_of(stage))
@@ -55,11 +49,6 @@ def _method(name: str, stage: StageReport, run: Run) -> str:
     if name == "reconstruct":
         words.append(f"{run.report.solver.method}: {run.report.solver.why}")
     return ", ".join(words)
-
-
-def with_page_time(html: str, seconds: float) -> str:
-    """Return a page with the time that it took."""
-    return html.replace(PAGE_TIME, _seconds(seconds))
 
 
 def _seconds(value: float) -> str:

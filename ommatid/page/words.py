@@ -114,7 +114,7 @@ def key_numbers(report: RunReport) -> list[tuple[str, str, str]]:
             numbers.append(("SSIM", f"{error.ssim:.4f}", _beside(error, "ssim", "{:.4f}", "1 if identical")))
     seconds = sum(stage.seconds for stage in report.stages.values())
     sizes = f"{report.measurements} measurements, {report.unknowns} unknowns"
-    return [*numbers, ("Run time", f"{seconds:.3g} s", sizes)]
+    return [*numbers, ("Computing time", f"{seconds:.3g} s", sizes)]
 
 
 def _beside(error: ErrorReport, name: str, form: str, otherwise: str) -> str:

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.printable import printable_sentence
 from ommatid.scenes.formats import picture
-from ommatid.scenes.scene import read
 
 from .stages import library_versions, open_member, process_count
 
@@ -47,13 +45,13 @@ def batch_members(
     that no folder can have.
     """
     axes = sweep.sweep_axes(sweeps or ())
-    members = sweep.members(scenes, axes, folder)
+    members = sweep.members(scenes, axes, folder, changes, lenses)
     for scene in scenes:
         sweep.check_keys(scene, axes, changes, lenses)
     return members
 
 
-def batch_warnings(members: Sequence[Member], changes: Sequence[str], lenses: Sequence[str]) -> list[str]:
+def batch_warnings(members: Sequence[Member]) -> list[str]:
     """Return what is lost when the pictures of the scenes are read, a sentence each.
 
     Scenes with errors have none; their errors are reported when they are run.
@@ -61,23 +59,16 @@ def batch_warnings(members: Sequence[Member], changes: Sequence[str], lenses: Se
     of_picture: dict[str | None, list[str]] = {}  # each is read once
     for member in members:
         with suppress(InputError):
-            scene = read(member.scene, (*changes, *member.changes), lenses)
-            if scene.target.image not in of_picture:
-                of_picture[scene.target.image] = picture.conversions(scene)
+            if member.content.target.image not in of_picture:
+                of_picture[member.content.target.image] = picture.conversions(member.content)
     return [sentence for sentences in of_picture.values() for sentence in sentences]
 
 
 def scene_batch(
-    changes: Sequence[str],
-    lenses: Sequence[str],
-    stages: Stages,
-    observe: Callable[[Path], RunObserver],
-    report: Callable[[Member, Description], Description],
+    stages: Stages, observe: Callable[[Path], RunObserver], report: Callable[[Member, Description], Description]
 ) -> Batch:
-    """Create the batch that does `stages` with every scene after `changes`, and passes each result to `report`."""
-    options = tuple(changes), tuple(lenses)
-    open_scene, count = partial(open_member, *options), partial(process_count, *options)
-    return Batch(open_scene, stages, observe, report, library_versions, count)
+    """Create the batch that does `stages` with every scene, and passes each result to `report`."""
+    return Batch(open_member, stages, observe, report, library_versions, process_count)
 
 
 def share_of_job(job: str, members: Sequence[Member], scheduler: str = "") -> tuple[list[Member], str]:

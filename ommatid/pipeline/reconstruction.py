@@ -9,15 +9,17 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import perf_counter
 
 from ommatid.analysis.study import remove_study
 from ommatid.batch.frames import FrameOptions
+from ommatid.batch.remote import SILENT
 from ommatid.page.batch_index import INDEX, cached_index
 from ommatid.page.cached import REPORT, cached_page
 from ommatid.reconstruct.output import result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture, clear_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
-from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport
+from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport, with_stage
 from ommatid.reconstruct.restore import check_camera
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
@@ -35,6 +37,8 @@ from ommatid.scenes.scene import TRUTH, WORLD_PICTURE, CalibrationTable, Scene, 
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables import toml
+
+from .stages import StageResults, calibrated_model, earlier_report, finish
 
 STACK, MODEL = "stack.exr", "model.npz"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", ".json", ".html")
@@ -75,7 +79,7 @@ def reconstruct_files(
         result, report = result_files.reconstruct(recorded, calibrated, truth, names, pool, progress)
     report = report.with_changes(**region_reports(result, options.regions))
     clear_formats(output)
-    result_files.write_estimate(output, result, {"title": recorded.scene.title})
+    result_files.write_estimate(output, result, result_files.record_of(report))
     result_files.write_picture(output.with_suffix(".png"), result.estimate.reshape(result.shape))
     return report
 
@@ -100,7 +104,7 @@ def reconstruct_folder(
     for name in (STACK, MODEL, TRUTH, WORLD_PICTURE):
         if real_path(folder / name) in sources:
             raise InputError(f"{folder / name}: would replace a file that is read; choose another folder with -o")
-    with occupied(folder, RUN):
+    with occupied(folder, result_files.ESTIMATE):
         _remove_other_scene(folder, recorded)
         if result_files.truth_beside(stack, recorded) is not None:
             for name in (TRUTH, WORLD_PICTURE):
@@ -138,14 +142,22 @@ def finish_folder(
     force: bool = False,
 ) -> tuple[RunReport, bool]:
     """Reconstruct the stack in a folder with the model in it, and write the page, unless they are up to date."""
-    names = folder / STACK, folder / MODEL
-    files = stack_file.read(names[0]), model_file.read(names[1]), names
-    report, made = result_files.cached_results(folder, *files, progress, workers, tuple(regions), force)
+    begun, names = perf_counter(), (folder / STACK, folder / MODEL)
+    recorded, calibrated = stack_file.read(names[0]), model_file.read(names[1])
+    report, made = result_files.cached_results(
+        folder, recorded, calibrated, names, progress, workers, tuple(regions), force
+    )
+    report = _with_design(report, recorded.scene)
+    earlier = earlier_report(folder, report.fingerprint)
+    if earlier is not None:
+        beside = {name: value for name in ("study", "depth") if (value := getattr(earlier, name))}
+        report = report.with_changes(**beside)
+        report = with_stage(report, "study", earlier.stages["study"].seconds) if "study" in earlier.stages else report
     if not report.study:
         remove_study(folder)
-    _note_design(folder, report, files[0].scene)
-    _write_page(folder)
-    return run_json.read(folder), made
+    files = max(perf_counter() - begun - report.stages["reconstruct"].seconds, 0.0)
+    results = StageResults(report, recorded, calibrated, made, files)
+    return finish(results, folder, SILENT), made
 
 
 def _design_instead(report: RunReport, scene: Scene) -> str:
@@ -156,12 +168,12 @@ def _design_instead(report: RunReport, scene: Scene) -> str:
     return f"H as designed was taken, although the scene asks for calibration.method '{asked}'"
 
 
-def _note_design(folder: Path, report: RunReport, scene: Scene) -> None:
-    """Add the note to the verdict in run.json, once."""
+def _with_design(report: RunReport, scene: Scene) -> RunReport:
+    """Add the note to the verdict."""
     note, verdict = _design_instead(report, scene), report.verdict
-    if note and verdict is not None and note not in verdict.notes:
-        noted = verdict.model_copy(update={"notes": (*verdict.notes, note)})
-        run_json.write(folder, report.with_changes(verdict=noted))
+    if not note or verdict is None:
+        return report
+    return report.with_changes(verdict=verdict.model_copy(update={"notes": (*verdict.notes, note)}))
 
 
 def _design_warnings(folder: Path) -> tuple[str, ...]:
@@ -171,10 +183,11 @@ def _design_warnings(folder: Path) -> tuple[str, ...]:
 
 
 def _write_page(folder: Path) -> None:
+    """Write the page of a finished run."""
     from ommatid.simulate.ideal import matrix_as_designed
 
-    _, camera = stack_file.read_header(folder / STACK)
-    cached_page(folder, partial(matrix_as_designed, camera))
+    report, recorded = run_json.read(folder), stack_file.read(folder / STACK)
+    cached_page(folder, report, partial(matrix_as_designed, recorded.camera), recorded)
 
 
 @dataclass(frozen=True)
@@ -233,7 +246,7 @@ def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcom
     """Reconstruct a stack with the model beside it, or with H as designed, and write the page."""
     model = stack.with_name(MODEL)
     if real_path(folder) == real_path(stack.parent):
-        with occupied(folder, RUN):
+        with occupied(folder, result_files.ESTIMATE):
             warnings = () if model.is_file() else (_write_designed_model(stack, model, progress),)
             finish_folder(folder, progress)
         return ReportOutcome((folder,), None, warnings or _design_warnings(folder))
@@ -248,8 +261,6 @@ def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcom
 
 def _write_designed_model(stack: Path, model: Path, progress: Progress) -> str:
     """Write H as designed for the camera of a stack, and return a warning. Raises InputError without a closed form."""
-    from .stages import calibrated_model
-
     scene, _ = stack_file.read_header(stack)
     ideal = CalibrationTable(method="ideal")
     calibrated_model(Setup.from_scene(with_tables(scene, calibration=ideal)), model, progress)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ommatid.batch.batch import Member, check_files, prepare
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
-from ommatid.reconstruct.output.run_json import FILES, RunReport, StudyCase, TimeReport, with_stage
+from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output.run_json import FILES, PAGE, RunReport, with_stage
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.machine import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene, read
@@ -28,6 +31,25 @@ from ommatid.simulate.render import cached_stack
 from ommatid.simulate.renderer.variant import check_transport_variant
 from ommatid.simulate.renderer.variant import choose as choose_variant
 from ommatid.simulate.validation import check_scene, check_scene_memory
+
+if TYPE_CHECKING:
+    from ommatid.analysis.study import StudyFile
+
+
+@dataclass(frozen=True)
+class StageResults:
+    """What the stages of a run made or found in its folder.
+
+    made : True if the estimate was made;  files : seconds of the stages for reading, checking and writing files
+    start_up : seconds from the start of the process to the first stage, None where it ran other scenes, too
+    """
+
+    report: RunReport
+    stack: Stack
+    model: Model
+    made: bool
+    files: float
+    start_up: float | None = None
 
 
 def open_scene(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
@@ -46,23 +68,23 @@ def checked_setup(scene: Scene) -> Setup:
     return Setup(scene, camera, None if without_picture else load(scene))
 
 
-def open_member(changes: Sequence[str], lenses: Sequence[str], member: Member) -> Setup:
-    """Open a scene of a batch, with the changes of all scenes and then its own."""
-    return open_scene(member.scene, (*changes, *member.changes), lenses)
+def open_member(member: Member) -> Setup:
+    """Check a scene of a batch, its camera and its target image, before anything is written. Raises InputError."""
+    return checked_setup(member.content)
 
 
-def process_count(changes: Sequence[str], lenses: Sequence[str], members: Sequence[Member]) -> int:
+def process_count(members: Sequence[Member]) -> int:
     """Return the number of processes that finishes a batch soonest, of as many as fit into memory."""
     from ommatid.batch.plan import concurrent_by_memory, estimate_cost, fastest_process_count
 
-    costs = [estimate_cost(member, changes, lenses) for member in members]
+    costs = [estimate_cost(member) for member in members]
     most = min(concurrent_by_memory([cost.memory for cost in costs]), len(members), processors())
     return fastest_process_count([cost.seconds for cost in costs], most, processors())
 
 
 def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
     """Execute all stages of a scene, here or on a worker, and return the content of run.json."""
-    return with_page(results(setup, folder, observer), setup.camera, folder, observer).plain()
+    return finish(results(setup, folder, observer), folder, observer).plain()
 
 
 def with_figures(stages: Stages, figures: FigureFiles) -> Stages:
@@ -74,13 +96,14 @@ def _and_figures(
     stages: Stages, figures: FigureFiles, setup: Setup, folder: Path, observer: RunObserver
 ) -> dict[str, Any]:
     from ommatid.analysis.depth_error import PICTURE, draw
-    from ommatid.reconstruct.output import run_json
     from ommatid.reconstruct.output.overview import write_overview
+    from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
     from ommatid.scenes import stack
 
     description = stages(setup, folder, observer)
     report = run_json.read(folder)
-    write_overview(folder, stack.read(folder / "stack.exr"), report, figures)
+    channels = read_estimate(folder / ESTIMATE).channels
+    write_overview(folder, stack.read(folder / "stack.exr"), channels, report, figures)
     if report.depth:
         draw(folder / PICTURE, setup.camera, report.depth, files=figures)
     return description
@@ -108,11 +131,10 @@ def check_render(setup: Setup, folder: Path) -> None:
 
 
 @one_thread()
-def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
-    """Execute all stages of a scene except the page. What is left of the time is that of its files."""
+def results(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
+    """Execute all stages of a scene but write neither its page nor run.json."""
     from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
-    from ommatid.reconstruct.output import run_json
     from ommatid.reconstruct.output.result_files import cached_results
 
     scene, camera = setup.scene, setup.camera
@@ -125,47 +147,52 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> RunReport:
     with observer.progress("reconstruct") as progress:
         report, made = cached_results(folder, stack, model, (folder / "stack.exr", folder / "model.npz"), progress)
     observer.done("reconstruct", made)
-    complete, worked = report, {"render": rendered, "calibrate": calibrated, "reconstruct": made}
+    worked = {"render": rendered, "calibrate": calibrated, "reconstruct": made}
+    files = perf_counter() - begun - sum(report.stages[name].seconds for name, ran in worked.items() if ran)
     if scene.world is not None:
         from ommatid.analysis.depth_error import depth_error_of_run
 
-        complete = complete.with_changes(depth=depth_error_of_run(folder, camera))
-    if made:
-        computing = sum(complete.stages[name].seconds for name, ran in worked.items() if ran)
-        complete = with_stage(complete, FILES, max(perf_counter() - begun - computing, 0.0))
-        if start_up is not None:
-            spent = TimeReport.model_validate({**complete.spent.plain(), "start_up": start_up})
-            complete = complete.with_changes(spent=spent)
+        report = report.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
-        begun = perf_counter()
-        cases, made = _studied(setup, stack, folder, observer)
-        complete = complete.with_changes(study=cases)
-        complete = with_stage(complete, "study", perf_counter() - begun) if made else complete
+        studied = _studied(setup, stack, folder, observer)
+        report = with_stage(report.with_changes(study=studied.cases), "study", studied.seconds)
     else:
         study.remove_study(folder)
-    if complete.plain() != report.plain():
-        run_json.write(folder, complete)
-    return complete
+    return StageResults(report, stack, model, made, max(files, 0.0), start_up)
 
 
-def with_page(report: RunReport, camera: Camera, folder: Path, observer: RunObserver) -> RunReport:
-    """Write report.html of a folder whose run.json is `report`, and return the report with the time of the page."""
-    if not write_page(camera, folder, observer):
-        return report
-    from ommatid.reconstruct.output import run_json
+def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunReport:
+    """Write the page and run.json of results, and return its content. Where nothing was made, earlier times stay."""
+    begun = perf_counter()
+    write_page(results, folder, observer)
+    times = results.files, perf_counter() - begun, results.start_up
+    earlier = earlier_report(folder, results.report.fingerprint)
+    if earlier is not None and not results.made:
+        files, page = (earlier.stages[name].seconds if name in earlier.stages else 0.0 for name in (FILES, PAGE))
+        times = files, page, earlier.spent.start_up
+    report = run_json.with_times(results.report, *times)
+    if earlier is None or report.plain() != earlier.plain():
+        run_json.write(folder, report)
+    return report
 
-    return run_json.read(folder)
+
+def earlier_report(folder: Path, fingerprint: str) -> RunReport | None:
+    """Return the content of run.json if it is of the estimate with this fingerprint."""
+    with suppress(OSError, ValueError, InputError):
+        report = run_json.read(folder)
+        return report if report.fingerprint == fingerprint else None
+    return None
 
 
-def write_page(camera: Camera, folder: Path, observer: RunObserver) -> bool:
-    """Write report.html of the results in a folder unless it is up to date, and return True if it was written."""
+def write_page(results: StageResults, folder: Path, observer: RunObserver) -> None:
+    """Write report.html of results unless it is up to date."""
     from ommatid.page.cached import cached_page
     from ommatid.simulate.ideal import matrix_as_designed
 
     with observer.progress("report"):
-        made = cached_page(folder, partial(matrix_as_designed, camera))
+        ideal = partial(matrix_as_designed, results.stack.camera)
+        made = cached_page(folder, results.report, ideal, results.stack, results.model)
     observer.done("report", made)
-    return made
 
 
 def render(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
@@ -236,14 +263,14 @@ def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> tuple[Stack,
     return stack, made
 
 
-def _studied(setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> tuple[tuple[StudyCase, ...], bool]:
-    """Reconstruct the stack with every model of H that the scene's study names; True if that had to be done."""
+def _studied(setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> StudyFile:
+    """Reconstruct the stack with every model of H that the scene's study names."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.study import cached_study, study_models
     from ommatid.reconstruct.output.result_files import truth_beside
 
     with observer.progress("study") as progress:
         known = study_models(setup, folder, no_progress, for_stack(stack))
-        cases, made = cached_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
+        studied, made = cached_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
     observer.done("study", made)
-    return cases, made
+    return studied

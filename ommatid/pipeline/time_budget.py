@@ -19,13 +19,13 @@ from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.run_json import STAGES, ErrorReport, RequestedTime, RunReport, TimeReport
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import read_text
-from ommatid.scenes import model_file, stack
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables import toml
 from ommatid.scenes.tables.units import DURATION
 
 from . import stages
+from .stages import StageResults, finish, write_page
 from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, bench_error_curves, error_curve
 
 FEW, MORE = 256, 1024  # samples per pixel of the two measuring runs
@@ -106,36 +106,36 @@ def run_within(
     requested = RequestedTime(seconds=seconds, scenes=1) if request is None else request
     earlier = _earlier_run(folder, setup, requested)
     if earlier is not None:
-        report = stages.results(_with_samples(setup, *_samples_of(earlier.chosen)), folder, observer)
+        results = stages.results(_with_samples(setup, *_samples_of(earlier.chosen)), folder, observer)
         same = earlier.model_dump(include={"within", "asked", "seconds", "chosen"})
-        return _finish(setup, folder, observer, report, same)
+        return _finish(results, folder, observer, same)
 
     few = _measured_run(setup, FEW, folder, observer, clock)
-    report, chosen = few.report, (FEW, FEW)
-    page = _page_seconds(setup, folder, observer, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
+    results, chosen = few.results, (FEW, FEW)
+    page = _page_seconds(few.results, folder, observer, clock) if seconds - (clock() - begun) > 2 * few.wall else 0.0
 
     def left() -> float:
         return (1 - RESERVE) * (seconds - (clock() - begun)) - page
 
     remaining = left()
     if _needs_few_samples(setup):
-        chosen, report = _adaptive_run(setup, folder, observer, few, remaining)
+        chosen, results = _adaptive_run(setup, folder, observer, few, remaining)
     elif (curves := _bench_curves(folder, setup)) is not None or remaining > 2 * few.wall:
         if curves is None:
             more = _measured_run(setup, MORE, folder, observer, clock)
-            report, chosen, curves = more.report, (MORE, MORE), _fitted_curves(setup, few, more)
+            results, chosen, curves = more.results, (MORE, MORE), _fitted_curves(setup, few, more)
             remaining = left()
-        allocation = _better(report.error, curves, remaining - few.other - COMPILATION)
+        allocation = _better(results.report.error, curves, remaining - few.other - COMPILATION)
         if allocation is not None:
             chosen = allocation.render, allocation.calibrate
-            report = stages.results(_with_samples(setup, *chosen), folder, observer)
+            results = stages.results(_with_samples(setup, *chosen), folder, observer)
     total = clock() - begun + page  # the final page is still to be written
     if total > seconds:
         fewest = ", the fewest possible" if chosen[0] == FEW else ""
         samples = f"{chosen[0]} and {chosen[1]} samples per pixel{fewest}"
         say(f"{folder}: took {total:.1f} s of {seconds:g} s with {samples}")
     spent = {"within": seconds, "asked": requested, "seconds": total, "chosen": dict(zip(KEYS, chosen, strict=True))}
-    return _finish(setup, folder, observer, report, spent)
+    return _finish(results, folder, observer, spent)
 
 
 def _with_samples(setup: Setup, rendering: Samples, calibration: Samples) -> Setup:
@@ -159,9 +159,14 @@ class MeasuredRun:
     wall : seconds;  variance : of each stage's result, proportional to its part of the error
     """
 
-    report: RunReport
+    results: StageResults
     wall: float
     variance: dict[str, float]
+
+    @property
+    def report(self) -> RunReport:
+        """Return the report of its stages."""
+        return self.results.report
 
     def seconds(self, stage: str) -> float:
         """Return the time of a stage."""
@@ -189,20 +194,19 @@ def _samples_of(chosen: Mapping[str, Samples]) -> tuple[Samples, Samples]:
 
 def _measured_run(setup: Setup, samples: int, folder: Path, observer: RunObserver, clock: Clock) -> MeasuredRun:
     start = clock()
-    report = stages.results(_with_samples(setup, samples, samples), folder, observer)
-    wall = clock() - start
-    model = model_file.read(folder / "model.npz")
+    results = stages.results(_with_samples(setup, samples, samples), folder, observer)
+    wall, model = clock() - start, results.model
     from_model = model.prior_variance_from_model(np.ones(model.unknowns)) if model.variance.any() else np.zeros(1)
-    light = stack.read(folder / "stack.exr").variance
-    return MeasuredRun(report, wall, {"render": float(np.nanmean(light)), "calibrate": float(np.nanmean(from_model))})
+    light = float(np.nanmean(results.stack.variance))
+    return MeasuredRun(results, wall, {"render": light, "calibrate": float(np.nanmean(from_model))})
 
 
 def _adaptive_run(
     setup: Setup, folder: Path, observer: RunObserver, few: MeasuredRun, remaining: float
-) -> tuple[tuple[Samples, Samples], RunReport]:
+) -> tuple[tuple[Samples, Samples], StageResults]:
     """Run with 'auto' if its first round fits into the remaining seconds, else keep the run with few samples."""
     if remaining <= FIRST_ROUND * few.sampled + few.seconds("reconstruct") + few.other:
-        return (FEW, FEW), few.report
+        return (FEW, FEW), few.results
     return ("auto", "auto"), stages.results(_with_samples(setup, "auto", "auto"), folder, observer)
 
 
@@ -213,10 +217,10 @@ def _better(error: ErrorReport, curves: Curves, seconds: float) -> TimeAllocatio
     return allocation if allocation is not None and allocation.predicted_mse < error.predicted_mse else None
 
 
-def _page_seconds(setup: Setup, folder: Path, observer: RunObserver, clock: Clock) -> float:
+def _page_seconds(results: StageResults, folder: Path, observer: RunObserver, clock: Clock) -> float:
     """Write the page of the present results, and return the seconds that it took, as the final one will."""
     start = clock()
-    stages.write_page(setup.camera, folder, observer)
+    write_page(results, folder, observer)
     return clock() - start
 
 
@@ -253,10 +257,8 @@ def _earlier_run(folder: Path, setup: Setup, requested: RequestedTime) -> TimeRe
     return earlier if same_scene and earlier.asked == requested else None
 
 
-def _finish(
-    setup: Setup, folder: Path, observer: RunObserver, report: RunReport, spent: dict[str, Any]
-) -> dict[str, Any]:
-    """Add the request and the times to run.json and to the page, and return the description."""
-    report = report.with_changes(spent=TimeReport.model_validate({**report.spent.plain(), **spent}))
-    run_json.write(folder, report)
-    return stages.with_page(report, setup.camera, folder, observer).plain()
+def _finish(results: StageResults, folder: Path, observer: RunObserver, spent: dict[str, Any]) -> dict[str, Any]:
+    """Write page and run.json with the request and the times, and return the description."""
+    spent_in_all = TimeReport.model_validate({**results.report.spent.plain(), **spent})
+    report = results.report.with_changes(spent=spent_in_all)
+    return finish(replace(results, report=report), folder, observer).plain()

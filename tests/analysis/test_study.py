@@ -128,11 +128,11 @@ def test_a_study_is_cached_and_printed(tmp_path: Path) -> None:
         return model if name != "true" else exact_model(stack.scene, stack.camera, true_matrix(stack.camera), "true")
 
     models: dict[StudyModel, Callable[[], Model]] = {"ideal": lambda: give("ideal"), "true": lambda: give("true")}
-    cases, fresh = study.cached_study(tmp_path, stack, models, truth)
+    studied, fresh = study.cached_study(tmp_path, stack, models, truth)
     assert (fresh, made) == (True, ["ideal", "true"])
-    assert study.cached_study(tmp_path, stack, models, truth) == (cases, False)
+    assert study.cached_study(tmp_path, stack, models, truth) == (studied, False)
     assert len(made) == 2, "no model is made again"
-    rows = dict(study.rows(cases))
+    rows = dict(study.rows(studied.cases))
     assert "OUTSIDE" in rows["the ideal H"]
     assert "inside" in rows["the true H"]
     table = (tmp_path / "study.csv").read_text(encoding="utf-8").splitlines()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from skimage.io import imsave
 
 from ommatid.batch.batch import prepare
 from ommatid.batch.remote import (
-    RunObserver,
     SceneOutcome,
     WorldPackage,
     carry_out,
@@ -22,10 +20,9 @@ from ommatid.batch.remote import (
     unpack,
     unpacked_world,
 )
-from ommatid.pipeline.stages import open_scene, results, run
+from ommatid.pipeline.stages import open_scene, run
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats import exr
-from ommatid.scenes.setup import Setup
 
 from ..conftest import TINY, Command
 from ..runs import assert_same_content, content
@@ -53,18 +50,14 @@ def deep(here: Path) -> Path:
     return here / "deep.toml"
 
 
-def without_page(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
-    return results(setup, folder, observer).plain()
-
-
 def test_a_world_gives_the_same_results_on_a_machine_without_its_files(deep: Path, here: Path) -> None:
     folder, alone, setup = here / "out", here / "alone", open_scene(deep, OUTSIDE_TOO)
-    assert outcome_of(lambda observer: without_page(setup, alone, observer)).error is None
+    assert outcome_of(lambda observer: run(setup, alone, observer)).error is None
     prepare(setup, folder)
     package = packed(setup, folder)
     for name in ("places", "pictures"):
         (here / name).rename(here / f"moved {name}")
-    outcome = carry_out(without_page, package)
+    outcome = carry_out(run, package)
     assert outcome.error is None
     unpack(outcome, folder)
     assert_same_content(folder, content(alone))

@@ -107,7 +107,7 @@ def answer(cell: Cell, folder: Path) -> str:
     names = "ommatid.runtime.machine.free_memory", "ommatid.reconstruct.method_choice.free_memory"
     with mock.patch(names[0], return_value=FREE), mock.patch(names[1], return_value=FREE):
         try:
-            described = plan(member, open_member((), (), member), (), ())
+            described = plan(member, open_member(member))
         except InputError as error:
             return "refused for memory" if " GB" in str(error) else str(error)
     return str(described["plan"]["reconstruct"]["method"])

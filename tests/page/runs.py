@@ -52,7 +52,7 @@ def letter_run(folder: Path, *, dead: int = 0, truth: bool = True) -> Run:
     make_folder(folder)
     result_files.write_estimate(folder / result_files.ESTIMATE, restoration, {})
     run_json.write(folder, report.with_changes(fingerprint="f"))
-    return read_run(folder, stack, model)
+    return read_run(folder, None, stack, model)
 
 
 def synthetic(small: Run, shape: tuple[int, int]) -> Run:

@@ -248,7 +248,7 @@ def test_contradictions_in_a_report_are_refused(
 def test_an_estimate_of_no_numbers_is_refused_and_made_again(
     channel: str, value: float, kept: Path, ommatid: Command
 ) -> None:
-    whole, (part,) = (kept / "estimate.exr").read_bytes(), exr.read(kept / "estimate.exr")
+    (part,) = exr.read(kept / "estimate.exr")
     values = part.channels[channel].copy()
     values[2, 1] = value
     exr.write(kept / "estimate.exr", [exr.Part(part.name, {**part.channels, channel: values}, part.record)])
@@ -257,7 +257,7 @@ def test_an_estimate_of_no_numbers_is_refused_and_made_again(
     assert result.code == 2
     assert "estimate.exr: expected a finite estimate" in result.err
     assert ommatid(*RUN).code == 0
-    assert (kept / "estimate.exr").read_bytes() == whole
+    np.testing.assert_array_equal(exr.read(kept / "estimate.exr")[0].channels[channel], part.channels[channel])
 
 
 @pytest.mark.parametrize("name", ["estimate.png", "overview.png"])

@@ -11,6 +11,7 @@ import pytest
 
 from ommatid.reconstruct.output import run_json, verdict_words
 from ommatid.reconstruct.output.overview import OVERVIEW, grid, headline, write_overview
+from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.scenes import stack as stack_file
 from ommatid.scenes.formats import exr
@@ -26,7 +27,8 @@ def test_the_last_panel_fills_what_is_left(count: int) -> None:
 
 def drawn(folder: Path) -> Any:
     figures = KeptFigures()
-    write_overview(folder, stack_file.read(folder / "stack.exr"), run_json.read(folder), figures)
+    channels = read_estimate(folder / ESTIMATE).channels
+    write_overview(folder, stack_file.read(folder / "stack.exr"), channels, run_json.read(folder), figures)
     return figures.kept[Path(OVERVIEW).stem]
 
 

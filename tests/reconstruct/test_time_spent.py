@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 from ommatid.reconstruct.output.run_json import (
-    FILES,
     PAGE,
     RunReport,
     StageReport,
     TimeReport,
+    of_stages,
     time_spent,
     with_stage,
-    without_page,
+    with_times,
 )
 
 from ..runs import report_of
@@ -36,7 +36,7 @@ def timed(**spent: object) -> RunReport:
 
 def test_every_stage_counts_in_the_total_and_in_the_time_with_more_samples() -> None:
     """Twice the samples take twice the 3 s of the stages that take samples, and 0.5 + 0.25 + 0.75 s as before."""
-    report = with_stage(with_stage(timed(start_up=0.3), FILES, 0.25), PAGE, 0.75)
+    report = with_times(timed(), files=0.25, page=0.75, start_up=0.3)
     assert report.spent.seconds == pytest.approx(4.5)
     assert report.spent.stages == {"render": 2.0, "calibrate": 1.0, "reconstruct": 0.5, "files": 0.25, "page": 0.75}
     assert report.spent.more[0].seconds == pytest.approx(2 * 3 + 1.5)
@@ -49,7 +49,8 @@ def test_a_time_limit_keeps_the_time_of_all_its_trials() -> None:
 
 
 @pytest.mark.parametrize("spent", [{}, {"within": 20.0, "seconds": 17.0}], ids=["plain", "time limit"])
-def test_a_page_stays_up_to_date_whatever_time_it_took(spent: dict[str, float]) -> None:
-    report = with_stage(timed(**spent), FILES, 0.25)
-    assert without_page(with_stage(report, PAGE, 0.75)) == without_page(report)
-    assert without_page(with_stage(report, FILES, 0.5)) != without_page(report)
+def test_the_report_of_the_stages_is_the_same_whatever_time_files_and_page_took(spent: dict[str, float]) -> None:
+    report = timed(**spent)
+    for files, page in ((0.25, 0.75), (0.5, 1.0)):
+        assert of_stages(with_times(report, files, page, start_up=0.3)).plain() == report.plain()
+    assert of_stages(with_stage(report, "study", 0.5)).plain() != report.plain()

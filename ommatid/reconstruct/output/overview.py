@@ -1,11 +1,12 @@
 """Overview of a result: the truth, a sub-image of each lens type, the estimate, its error and its standard deviation.
 
 Maps are drawn upright with pixels of the target along both axes; values are grey levels, 0 to 255. The verdict and the
-error stand above them. All is read from the files of the run, so that the figure can be drawn again in another format.
+error stand above them. All is in the files of a run, so that the figure can be drawn again in another format.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
@@ -14,15 +15,14 @@ from typing import Any, Literal
 import numpy as np
 
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.printable import printable_label
-from ommatid.scenes.formats import exr
 from ommatid.scenes.stack import Stack
 
 from . import verdict_words
 from .run_json import RunReport
 
-OVERVIEW, ESTIMATE = "overview.png", "estimate.exr"
+OVERVIEW = "overview.png"
 COLUMN_INCHES, ROW_INCHES = 3.4, 3.15
 LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.55, 1.25, 0.55  # inches around all panels; a layout by matplotlib takes a second
 MOST_IN_A_ROW = 6
@@ -41,9 +41,11 @@ class OverviewPanel:
 
 
 @own_style()
-def write_overview(folder: Path, stack: Stack, report: RunReport, files: FigureFiles = SCREEN_PNG) -> None:
-    """Draw the result in a folder, which has estimate.exr. Raises InputError or MachineError."""
-    maps = {name: channel.astype(np.float64) for name, channel in exr.read(folder / ESTIMATE)[0].channels.items()}
+def write_overview(
+    folder: Path, stack: Stack, channels: Mapping[str, Float32Array], report: RunReport, files: FigureFiles = SCREEN_PNG
+) -> None:
+    """Draw a result; channels : of its estimate.exr. Raises InputError or MachineError."""
+    maps = {name: channel.astype(np.float64) for name, channel in channels.items()}
     panels, grey = _panels(stack, maps), _grey_range(maps.get("truth", maps["estimate"]))
     rows, across = grid(len(panels) + 1)
     width, height = COLUMN_INCHES * across, ROW_INCHES * rows + TOP - 0.35

@@ -1,4 +1,4 @@
-"""The files of a reconstruction: estimate.exr, the pictures beside it, and run.json."""
+"""The files of a reconstruction: estimate.exr, which holds its report, too, and the pictures beside it."""
 
 from __future__ import annotations
 
@@ -27,15 +27,14 @@ from ommatid.scenes.stack import Stack
 
 from ..methods.method import Prepared
 from ..restore import Reconstruction, check_camera, restore
-from . import run_json
 from .estimate_formats import format_file
-from .overview import ESTIMATE, OVERVIEW, write_overview
+from .overview import OVERVIEW, write_overview
 from .report import report_of
-from .run_json import RegionReport, RunReport
+from .run_json import RUN, RegionReport, RunReport
 
 Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the corner, rows and columns
 
-PICTURE = "estimate.png"
+ESTIMATE, PICTURE = "estimate.exr", "estimate.png"
 PNG_END = b"IEND\xaeB`\x82"
 ESTIMATOR_TABLES = ("prior", "estimator", "tiles")
 
@@ -100,12 +99,16 @@ def reconstruct(
 
 
 def write_estimate(path: Path, restoration: Reconstruction, record: dict[str, Any]) -> None:
-    """Write channels `estimate`, `variance` (diagonal of Eq. 5) and, where it is known, `truth`, as float32."""
+    """Write the maps of a reconstruction. Raises MachineError."""
+    exr.write(path, [exr.Part("estimate", maps_of(restoration), record)])
+
+
+def maps_of(restoration: Reconstruction) -> dict[str, Float32Array]:
+    """Return `estimate`, `variance` (diagonal of Eq. 5) and, where it is known, `truth`: (rows, columns)."""
     channels = {"estimate": restoration.estimate, "variance": restoration.expected.variance}
     if restoration.truth is not None:
         channels["truth"] = restoration.truth
-    maps = {name: values.reshape(restoration.shape).astype(np.float32) for name, values in channels.items()}
-    exr.write(path, [exr.Part("estimate", maps, record)])
+    return {name: values.reshape(restoration.shape).astype(np.float32) for name, values in channels.items()}
 
 
 def read_estimate(path: Path) -> exr.Part:
@@ -129,18 +132,25 @@ def write_picture(path: Path, estimate: FloatArray) -> None:
 
 
 def write_results(folder: Path, stack: Stack, restoration: Reconstruction, report: RunReport) -> None:
-    """Write the four files of a run. run.json comes last: where it is, all are there. Raises MachineError.
+    """Write the estimate and its pictures, the estimate last: where it is, all are there. Raises MachineError.
 
-    The estimate of an earlier result in other formats is removed.
+    The report of an earlier result is removed first, and its estimate in other formats.
     """
-    if any((folder / name).exists() for name in (ESTIMATE, run_json.RUN)):
-        for name in ("npy", "tiff16"):
-            format_file(folder / ESTIMATE, name).unlink(missing_ok=True)
-    record = {"title": stack.scene.title, "fingerprint": report.fingerprint}
-    write_estimate(folder / ESTIMATE, restoration, record)
+    for path in (folder / RUN, *(format_file(folder / ESTIMATE, name) for name in ("npy", "tiff16"))):
+        path.unlink(missing_ok=True)
     write_picture(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
-    write_overview(folder, stack, report)
-    run_json.write(folder, report)
+    write_overview(folder, stack, maps_of(restoration), report)
+    write_estimate(folder / ESTIMATE, restoration, record_of(report))
+
+
+def record_of(report: RunReport) -> dict[str, Any]:
+    """Return what an estimate's file says of it: by its fingerprint it is known to be up to date."""
+    return {"title": report.title, "fingerprint": report.fingerprint, "report": report.plain()}
+
+
+def read_report(path: Path) -> RunReport:
+    """Read the report in an estimate's file. Raises InputError for another file, ValueError or KeyError without one."""
+    return RunReport.model_validate(read_estimate(path).record["report"])
 
 
 def fingerprint_of(stack: Stack, model: Model) -> str:
@@ -152,12 +162,9 @@ def fingerprint_of(stack: Stack, model: Model) -> str:
 
 
 def _read_results(folder: Path) -> tuple[RunReport, str | None]:
-    """Return run.json, and its fingerprint if all results are there, whole and of one reconstruction."""
-    report = run_json.read(folder)
-    made_from = read_estimate(folder / ESTIMATE).record["fingerprint"]
-    whole = report.fingerprint == made_from and all(_is_whole(folder / name) for name in (PICTURE, OVERVIEW))
-    earlier = report.verdict is None or (report.error.mse is not None and report.error.baseline is None)
-    return report, made_from if whole and not earlier else None
+    """Return the report of the estimate in a folder, and its fingerprint if the pictures beside it are whole."""
+    report = read_report(folder / ESTIMATE)
+    return report, report.fingerprint if all(_is_whole(folder / name) for name in (PICTURE, OVERVIEW)) else None
 
 
 def _is_whole(picture: Path) -> bool:
@@ -187,7 +194,7 @@ def cached_results(
     regions: tuple[Region, ...] = (),
     force: bool = False,
 ) -> tuple[RunReport, bool]:
-    """Return run.json of a folder, and True if the reconstruction was made for it: if needed, or by `force`."""
+    """Return the report of the estimate in a folder, and True if it was made: if needed, or by `force`."""
     current = fingerprint_of(stack, model)
     current = fingerprint([current, regions]) if regions else current
 

@@ -25,7 +25,7 @@ from ..prior import SpectralTerm
 INDEPENDENT = 1.0  # variance of independent samples falls as 1 / samples
 STRATIFIED = 1.5  # that of all other samplers as samples^-1.5, for pinholes
 MORE = (2, 4, 16)  # factors on the number of samples
-FILES, PAGE = "files", "page"  # stages beside those that compute: reading, checking and writing files; the report
+FILES, PAGE = "files", "page"  # stages beside those that compute: reading, checking and writing files; report.html
 STAGES = {"render": "rendering", "calibrate": "calibration"}  # to their parts of the error budget
 RUN = "run.json"
 EPS = 2.0**-52  # of float64
@@ -65,10 +65,21 @@ def with_stage(report: RunReport, name: str, seconds: float) -> RunReport:
     return _with_stages(report, {**report.stages, name: StageReport(seconds=seconds)})
 
 
-def before_page(report: RunReport) -> RunReport:
-    """Return a report as it was before the time of its page was added."""
-    stages = {name: stage for name, stage in report.stages.items() if name != PAGE}
-    return report if PAGE not in report.stages else _with_stages(report, stages)
+def of_stages(report: RunReport) -> RunReport:
+    """Return a report without the times of what surrounds its stages: start-up, files and page."""
+    computing = _with_stages(report, {name: each for name, each in report.stages.items() if name not in (FILES, PAGE)})
+    spent = computing.spent.plain()
+    spent.pop("start_up", None)
+    return computing.with_changes(spent=TimeReport.model_validate(spent))
+
+
+def with_times(report: RunReport, files: float, page: float, start_up: float | None) -> RunReport:
+    """Return the report of stages with the times of what surrounds them, in seconds."""
+    complete = with_stage(with_stage(report, FILES, files), PAGE, page)
+    if start_up is None:
+        return complete
+    spent = TimeReport.model_validate({**complete.spent.plain(), "start_up": start_up})
+    return complete.with_changes(spent=spent)
 
 
 def _with_stages(report: RunReport, stages: dict[str, StageReport]) -> RunReport:
@@ -77,18 +88,6 @@ def _with_stages(report: RunReport, stages: dict[str, StageReport]) -> RunReport
     if report.spent.within is not None:
         asked["seconds"] = report.spent.seconds  # of all trials together
     return report.with_changes(stages=stages, spent=TimeReport.model_validate({**spent.plain(), **asked}))
-
-
-def without_page(report: RunReport) -> dict[str, object]:
-    """Return the content of run.json that does not depend on the time that the page took."""
-    content = report.plain()
-    content["stages"].pop(PAGE, None)
-    content["spent"]["stages"].pop(PAGE, None)
-    if report.spent.within is None:
-        del content["spent"]["seconds"]
-    for more in content["spent"].get("more", ()):
-        del more["seconds"]
-    return content
 
 
 class Record(BaseModel):

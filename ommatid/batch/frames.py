@@ -12,7 +12,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import check_camera, check_region
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.pool import worker_pool
-from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint
+from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint, temporary_file
 from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.kinds import check_folder, check_name
 from ommatid.runtime.outputs.occupied import new_folder
@@ -193,8 +192,7 @@ def _in_processes(frames: Sequence[Frame], prepared: Prepared, options: FrameOpt
     others = frames[1:]
     if not others:
         return
-    with TemporaryDirectory(prefix="ommatid-") as scratch:
-        contents = Path(scratch) / "prepared"
+    with temporary_file(frames[0].output.with_name("prepared")) as contents:
         contents.write_bytes(pickle.dumps(prepared.contents(*SENT)))
         with worker_pool(count=min(workers, len(others))) as pool:
             for task in pool.each(partial(_made_in_process, options, contents), others):

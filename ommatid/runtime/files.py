@@ -42,7 +42,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
     check_output(path)
     clear_abandoned(path.parent, path.name)
     try:
-        with _temporary_file(path) as temporary:
+        with temporary_file(path) as temporary:
             write(temporary)
             with temporary.open("rb+") as stream:
                 os.fsync(stream.fileno())
@@ -62,8 +62,11 @@ def short_name(name: str) -> str:
 
 
 @contextmanager
-def _temporary_file(path: Path) -> Generator[Path]:
-    """Create an empty file beside `path`, locked while it is being written; remove it unless it was renamed."""
+def temporary_file(path: Path) -> Generator[Path]:
+    """Create an empty file beside `path`, locked and removed at the end, unless it was renamed.
+
+    `clear_abandoned` removes those of killed processes.
+    """
     while True:
         temporary = path.with_name(f".{secrets.token_hex(4)}{PART}{short_name(path.name)}")
         with temporary.open("xb") as stream:

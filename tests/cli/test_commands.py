@@ -272,7 +272,7 @@ def test_only_outdated_stages_are_repeated(setting: str, redone: set[str], kept:
     [
         ("stack.exr", "render"),
         pytest.param("model.npz", "calibrate", marks=pytest.mark.slow),
-        pytest.param("run.json", "reconstruct", marks=pytest.mark.slow),
+        ("run.json", ""),  # which is in estimate.exr, too
         pytest.param("estimate.exr", "reconstruct", marks=pytest.mark.slow),
     ],
 )
@@ -280,7 +280,8 @@ def test_a_damaged_file_is_replaced(name: str, stage: str, kept: Path, finished:
     whole = (kept / name).read_bytes()
     (kept / name).write_bytes(whole[: len(whole) // 2])
     # The repeated stage took another time, which is part of run.json, so the reconstruction is repeated too.
-    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, stage: True, **dict.fromkeys(REPEATED, True)}
+    again = dict.fromkeys((stage, *REPEATED), True) if stage else {}
+    assert done(ommatid("run", "tiny.toml", "-o", "out")) == {**NOTHING, **again}
     assert_same_light(kept / "stack.exr", finished / "stack.exr")
     described = [json.loads((folder / "run.json").read_text(encoding="utf-8")) for folder in (kept, finished)]
     assert numbers(described[0]) == numbers(described[1])

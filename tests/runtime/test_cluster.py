@@ -38,6 +38,10 @@ def squared(number: int) -> int:
     return number**2
 
 
+def endless(number: int) -> int:
+    return endless(number + 1) + 1
+
+
 @contextmanager
 def started(**options: Any) -> Generator[LocalCluster]:
     """A cluster in this process, which starts in a fraction of a second."""
@@ -224,6 +228,14 @@ def test_a_worker_that_joins_later_with_another_version_is_named(monkeypatch: py
         monkeypatch.setattr(f"{__name__}.VERSIONS", {"ommatid": "2"})  # what the worker says from now on
         with pytest.raises(InputError, match=r"the worker \S+ has ommatid 2, here 1; install the same versions"):
             pool.map(squared, range(2), no_progress, 2)
+
+
+def test_a_task_of_endless_recursion_ends() -> None:
+    """Dask waits for ever for an error whose traceback it cannot send."""
+    with started() as cluster, worker_pool(Cluster(cluster.scheduler_address)) as pool:
+        (task,) = pool.each(endless, [0])
+        with pytest.raises(RuntimeError, match="RecursionError: maximum recursion"):
+            task.result()
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 from ..errors import InputError, MachineError
 from ..printable import printable
 from . import workers
-from .workers import LOST, Completed, Workers
+from .workers import LOST, Completed, Workers, with_error_to_send
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -100,8 +100,14 @@ class _ClusterWorkers(Workers):
 
     def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Completed[Result]]:
         """Apply `function` as `Workers.each`; each task is preceded by the check of its worker."""
-        checked = function if self._requirement is None else partial(self._requirement.execute, function)
-        return super().each(checked, items)
+        return super().each(partial(_execute, self._requirement, function), items)
+
+
+def _execute(requirement: _Requirement | None, function: Callable[[Item], Result], item: Item) -> Result:
+    """Execute a task on this worker. Raises InputError if the worker differs."""
+    if requirement is not None:
+        requirement.check()
+    return with_error_to_send(partial(function, item))
 
 
 @dataclass(frozen=True)
@@ -112,12 +118,11 @@ class _Requirement:
     facts: Callable[[], dict[str, str]]
     expected: dict[str, str]
 
-    def execute(self, function: Callable[[Item], Result], item: Item) -> Result:
-        """Execute a task on this worker. Raises InputError if the worker differs."""
+    def check(self) -> None:
+        """Raise InputError if this worker differs."""
         from distributed import get_worker
 
         _check_same(self.cluster, get_worker().address, self.expected, self.facts())
-        return function(item)
 
 
 def _check_same(cluster: str, worker: str, expected: dict[str, str], facts: dict[str, str]) -> None:

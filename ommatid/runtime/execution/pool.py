@@ -9,7 +9,6 @@ finished stays.
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import sys
 from collections.abc import Callable, Generator
@@ -25,7 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ..errors import InputError
 from .interpreter import ignore_configurations, import_path, python_environment
 from .library_warnings import library_warnings, warn_on_stderr
-from .workers import Workers
+from .workers import Workers, with_error_to_send
 
 if TYPE_CHECKING:
     from .cluster import Cluster
@@ -152,19 +151,9 @@ def _interruptible(task: Callable[[], Result]) -> Result:
     """Execute a task in this process, which Ctrl-C interrupts."""
     signal.signal(signal.SIGINT, _interrupt_once)
     try:
-        return task()
-    except Exception as error:
-        if _is_sent_whole(error):
-            raise
-        raise RuntimeError(f"{type(error).__name__}: {error}") from error
+        return with_error_to_send(task)
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _is_sent_whole(error: Exception) -> bool:
-    with suppress(Exception):
-        return str(pickle.loads(pickle.dumps(error))) == str(error)
-    return False
 
 
 def _interrupt_once(number: int, frame: object) -> None:

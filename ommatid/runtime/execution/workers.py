@@ -6,11 +6,12 @@ worker executes a task.
 
 from __future__ import annotations
 
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from time import monotonic
@@ -61,6 +62,26 @@ class Completed(Generic[Result]):
             raise MachineError(
                 "every worker that tried it died; it may need more memory than they have, their logs say more"
             ) from error
+
+
+def with_error_to_send(task: Callable[[], Result]) -> Result:
+    """Execute a task; an error that another process could not be sent becomes a RuntimeError of the same words.
+
+    Pickles lose the words of some errors. Dask does not send one of endless recursion, and waits for it for ever.
+    """
+    try:
+        return task()
+    except Exception as error:
+        if _is_sent_whole(error):
+            raise
+        words = f"{type(error).__name__}: {error}"
+    raise RuntimeError(words)  # with a traceback of its own
+
+
+def _is_sent_whole(error: Exception) -> bool:
+    with suppress(Exception):
+        return str(pickle.loads(pickle.dumps(error))) == str(error) and not isinstance(error, RecursionError)
+    return False
 
 
 class Workers:

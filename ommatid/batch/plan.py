@@ -22,6 +22,8 @@ from ommatid.scenes.formats import exr
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import IN_PLACE_OF_AUTO
 from ommatid.simulate import calibrate, render
+from ommatid.simulate.calibration.entries import fits
+from ommatid.simulate.calibration.fit.fit import first_measured
 from ommatid.simulate.calibration.point_sources import RENDERINGS
 from ommatid.simulate.renderer import variant
 from ommatid.simulate.validation import check_scene
@@ -108,11 +110,21 @@ def estimate_cost(member: Member) -> CostEstimate:
         choice = choose_method(setup.scene, setup.camera, setup.is_applied)
     except InputError:
         return CostEstimate(0.0, 0)
-    calibration, samples = setup.scene.calibration, setup.scene.calibration.samples
-    rays_per_sample = 0.0 if calibration.method == "ideal" else RENDERINGS if setup.renders_points else 1.0
-    calibration_rays = rays_per_sample * (IN_PLACE_OF_AUTO if samples == "auto" else samples)
-    rays = setup.camera.measurements * (setup.scene.render.sample_count + calibration_rays)
+    samples = IN_PLACE_OF_AUTO if setup.scene.calibration.samples == "auto" else setup.scene.calibration.samples
+    rays = setup.camera.measurements * setup.scene.render.sample_count + _calibrated_pixels(setup) * samples
     return CostEstimate(FIXED + rays / RAYS + choice.seconds, PROGRAM_MEMORY + choice.memory)
+
+
+def _calibrated_pixels(setup: Setup) -> float:
+    """Return the number of pixels that are rendered to calibrate H, each once for every rendering."""
+    if setup.scene.calibration.method == "ideal":
+        return 0
+    pixels, with_kernels = 0, setup.scene.calibration.fit != "geometry"
+    subsets = first_measured(setup.simulated, with_kernels) if fits(setup) else {}
+    for lens in setup.simulated.types:
+        subset = subsets.get(lens.name)
+        pixels += lens.measurements if subset is None else subset.size
+    return pixels * (RENDERINGS if setup.renders_points else 1)
 
 
 def concurrent_by_memory(memory: Sequence[int]) -> int:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.machine import free_memory, processors
+from ommatid.runtime.machine import free_memory, processors, used_memory
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene
@@ -22,7 +22,8 @@ from .methods.method import Method
 from .methods.tile_method import TileMethod
 from .misalignment.alignment import AlignedMethod
 
-PROGRAM_MEMORY = 300_000_000  # bytes, of the program itself and its libraries
+PROGRAM_MEMORY = 500_000_000  # bytes, of the program itself and its libraries, the renderer with them
+VECTORS = 18  # of all measurements and of all pixels, that a run holds at once; measured at 1019 x 1019 pixels
 WORLD_IMAGES = 200  # of a world finer than f, that its solver holds at once; measured at 239 x 239 pixels of f
 MATRICES = 8  # of a small frame or of windows, that are held at once
 MOST_CORRELATED = 500  # pixels of a dense problem of correlated pixels where a frame serves: a second
@@ -145,9 +146,13 @@ def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> Meth
 
 
 def allowed_memory(limit: int | None) -> int:
-    """Return the bytes that may be used: the limit, at most what is free; without a limit half of what is free."""
+    """Return the bytes that may be used: the limit, at most what is free.
+
+    Without a limit half of what was free before this program, so that a run that began is not refused when it has
+    loaded its renderer.
+    """
     free = free_memory()
-    return free // 2 if limit is None else min(limit, free)
+    return min((free + used_memory()) // 2 if limit is None else limit, free)
 
 
 def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
@@ -156,7 +161,7 @@ def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:
     entries = 0 if exact else 12 * 10 * camera.measurements * widest**2
     if method == "dense":
         return needed_memory(camera.measurements, camera.unknowns, correlated=correlated) + entries
-    images = 8 * (5 * camera.measurements + 16 * camera.unknowns)
+    images = 8 * VECTORS * (camera.measurements + camera.unknowns)
     if method == "tiles":
         side = scene.tiles.size**2
         return PROGRAM_MEMORY + images + entries + 2 * processors() * needed_memory(3 * side, side)

@@ -52,6 +52,13 @@ def free_memory() -> int:
     return max(min(free, limit - int(psutil.Process().memory_info().vms)), 0)
 
 
+def used_memory() -> int:
+    """Return the bytes that this process has, of address space where that is limited."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    used = psutil.Process().memory_info()
+    return int(used.rss if limit == resource.RLIM_INFINITY else used.vms)
+
+
 def check_memory(needed: int, what: str, cure: str) -> None:
     """Raise InputError if `what` needs more bytes than are free; the message ends with `cure`, the advice."""
     if needed <= SMALL:

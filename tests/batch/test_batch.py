@@ -65,6 +65,7 @@ def test_memory_is_that_of_the_largest_scenes(here: Path, monkeypatch: pytest.Mo
     needed = PROGRAM_MEMORY + 7 * 8 * 3600**2
     for free, expected in ((needed * 1.5, 1), (needed * 2.5, 2), (needed * 50, 5)):
         monkeypatch.setattr(method_choice, "free_memory", lambda free=free: 2 * int(free))
+        monkeypatch.setattr(method_choice, "used_memory", lambda: 0)
         assert concurrent_by_memory([estimate_cost(member).memory for member in (*small, *large)]) == expected
 
 

@@ -385,7 +385,7 @@ def test_a_measurement_without_noise_is_refused() -> None:
         ((479, 479), UNFITTED, {"noise": NOISE}, "tiles"),
         ((239, 239), FITTED, {"noise": NOISE, "estimator": {"method": "tiles"}}, "tiles"),
         ((59, 59), FITTED, {"noise": NOISE, "estimator": {"method": "frame"}}, "frame"),
-        ((59, 59), FITTED, {"noise": NOISE, "estimator": {"memory": "650 MB"}}, "tiles"),
+        ((63, 63), FITTED, {"noise": NOISE, "estimator": {"memory": "850 MB"}}, "tiles"),
     ],
 )
 def test_which_method_is_chosen(shape: tuple[int, int], lenses: Any, tables: dict[str, Any], method: str) -> None:
@@ -393,7 +393,7 @@ def test_which_method_is_chosen(shape: tuple[int, int], lenses: Any, tables: dic
     choice = choose_method(scene, derive(scene), exact=True)
     assert choice.method == method
     assert choice.method in METHODS
-    assert choice.memory <= 650e6 or scene.estimator.memory is None
+    assert choice.memory <= 850e6 or scene.estimator.memory is None
 
 
 def test_too_little_memory_for_any_method_is_refused() -> None:

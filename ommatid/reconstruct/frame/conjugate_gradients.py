@@ -238,7 +238,7 @@ class FrameSystem:
         (Notay 2000, Eq. 4).
         """
         direction, energy = None, 1.0
-        before = np.empty_like(residual) if isinstance(self.similar, Refined) else None
+        before = np.zeros_like(residual) if isinstance(self.similar, Refined) else None
         while True:
             waves = self._waves(residual)
             yield waves

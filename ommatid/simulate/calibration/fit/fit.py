@@ -121,15 +121,14 @@ def calibrate_by_fit(
     rays : per pixel of each lens type, of all passes;  recorded : as of `explanation`
     with_kernels : True if kernels may explain blur
     """
-    charted = {lens.name: has_chart(camera, lens, with_kernels) for lens in camera.types}
-    charts = {lens.name: _chart(camera, lens) for lens in camera.types}
-    subsets: Subsets = {name: chart if charted[name] else None for name, chart in charts.items()}
+    subsets = first_measured(camera, with_kernels)
+    charted = {name: subset is not None for name, subset in subsets.items()}
     responses = measure(subsets)
     fits = {
         lens.name: _fit_type(camera, lens, subs, responses, rows, rays[lens.name], charted[lens.name], recorded)
         for lens, subs, rows in zip(camera.types, _by_type(camera), camera.type_slices(), strict=True)
     }
-    charted = {lens.name: charted[lens.name] and charts[lens.name].size < lens.measurements for lens in camera.types}
+    charted = {lens.name: charted[lens.name] and _chart(camera, lens).size < lens.measurements for lens in camera.types}
     unexplained: Subsets = {
         lens.name: chart_of(lens, ~fits[lens.name].views.explained)
         for lens in camera.types
@@ -147,6 +146,11 @@ def calibrate_by_fit(
     )
     record = {"kind": "auto" if with_kernels else "geometry", **_record(camera, fits, subsets)}
     return FittedCalibration(fitted, rest, responses, record)
+
+
+def first_measured(camera: Camera, with_kernels: bool = True) -> Subsets:
+    """Return the pixels of each lens type that are measured first, None for all."""
+    return {lens.name: _chart(camera, lens) if has_chart(camera, lens, with_kernels) else None for lens in camera.types}
 
 
 def _chart(camera: Camera, lens: LensType) -> IntArray:

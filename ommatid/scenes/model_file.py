@@ -95,6 +95,8 @@ def read(path: Path) -> Model:
         raise InputError(f"{path}: its matrix is {shape}, its scene needs {expected}; calibrate again")
     if fitted is None:
         return Model(scene, camera, matrix, arrays["variance"], arrays["batches"], record)
+    if matrix is not None and _overlap(fitted, matrix):
+        raise InputError(f"{path}: has rows of H that both few numbers and entries describe; calibrate again")
     rest = None if matrix is None else MeasuredRows(matrix, arrays["variance"], arrays["batches"])
     return fitted_model(scene, camera, fitted, rest, record)
 
@@ -112,6 +114,15 @@ def _fitted(arrays: dict[str, NDArray[Any]], camera: Camera) -> FittedMatrix | N
     if "data" not in arrays and not all(views[name].explained.all() for name in views.keys() - fitted.kernels.keys()):
         raise ValueError("it has sub-imagers that neither numbers nor entries describe")
     return fitted
+
+
+def _overlap(fitted: FittedMatrix, matrix: sparse.csr_array) -> bool:
+    """Return True if both few numbers and entries describe a row of H."""
+    described = [
+        np.repeat(fitted.views[lens.name].explained | (lens.name in fitted.kernels), lens.measurements // lens.count)
+        for lens in fitted.camera.types
+    ]
+    return bool(np.diff(matrix.indptr)[np.concatenate(described)].any())
 
 
 def _kernels(arrays: dict[str, NDArray[Any]], camera: Camera, prefix: str) -> KernelFootprints | None:

@@ -16,6 +16,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.fitted import view
+from ommatid.scenes.formats import npz
 from ommatid.scenes.hardware import point_sources
 from ommatid.scenes.hardware.frames import AcquisitionSettings
 from ommatid.scenes.hardware.point_sources import from_recorded_points
@@ -28,6 +29,7 @@ from ommatid.simulate.ideal import ideal_matrix
 from ..conftest import Command
 from ..examples import camera, familywise
 from .mosaics import SCENE, SENSOR, SHAPE, Array, as_mosaic, save
+from .test_model_file import sealed
 
 ENTRIES = "--set", "calibration.fit=none"
 GAIN, READ = 0.02, 0.3  # units of f: of one electron, and of the read noise
@@ -249,7 +251,14 @@ def test_a_dead_sub_imager_and_points_without_noise_have_entries_alone(
     values[imaging_camera.slices()[2]] = np.nan
     np.save("points.npy", frames + as_mosaic(imaging_camera, values).astype(np.float32))
     assert ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz").code == 0
-    assert model_file.read(Path("h.npz")).record["fit"]["refused"] == [imaging_camera.sub_imagers[2].name]
+    model = model_file.read(Path("h.npz"))
+    assert model.record["fit"]["refused"] == [imaging_camera.sub_imagers[2].name]
+    arrays = npz.read(Path("h.npz"))
+    for lens in imaging_camera.types:
+        arrays[f"views.{lens.name}.explained"] = np.ones(lens.count, dtype=np.bool_)
+    sealed(Path("twice.npz"), arrays)
+    with pytest.raises(InputError, match="rows of H that both few numbers and entries describe"):
+        model_file.read(Path("twice.npz"))
     exact = [as_mosaic(imaging_camera, ideal_matrix(imaging_camera) @ unit) for unit in np.eye(imaging_camera.unknowns)]
     np.save("points.npy", 255 * np.array(exact, dtype=np.float32))
     assert ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz").code == 0

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.reconstruct.output.facts import on_topic
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.output.verdict_words import error_words, grounds, heading
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.printable import printable
 from ommatid.scenes.model import Model
@@ -77,15 +77,9 @@ def result_html(
     """Show the image, its posterior standard deviation and, where the truth is known, its error: (rows, columns)."""
     values = 0.0, 255.0
     pictures: list[Picture] = [("image", image, values), ("posterior standard deviation", deviation, None)]
-    rows = [("verdict", f"{heading(summary)}: {grounds(summary)}")]
-    rows += [("expected mean squared error", error_words(summary.error.predicted_mse))]
+    rows = [fact.row for fact in on_topic(summary, "verdict", "error", "quality", "limit")]
     if truth is not None and summary.error.mse is not None:
         pictures = [("truth", truth, values), *pictures, ("error", image - truth, None)]
-        rows.append(("measured mean squared error", error_words(summary.error.mse)))
-    rows += [
-        ("degrees of freedom", f"{summary.diagnostics.degrees_of_freedom:.4g} of {image.size}"),
-        ("method", f"{summary.solver.way}, {summary.solver.method}"),
-    ]
     return _html(title, pictures, rows)
 
 

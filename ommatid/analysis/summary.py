@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ommatid.reconstruct.method_choice import MethodChoice
+from ommatid.reconstruct.output.facts import skipped_words
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.geometry.optical_terms import camera_warnings, optical_terms
 from ommatid.scenes.lens_type import LensType
@@ -184,11 +185,6 @@ def sections(description: dict[str, Any]) -> list[Section]:
         ("What will run", stages),
         ("What is left out, and why", skipped),
     ]
-
-
-def skipped_words(why: str, bound: float | None) -> str:
-    """Return the reason for skipping an effect, with the bound on its effect."""
-    return why if bound is None else f"{why}; no measurement changes by more than {bound:.2g}"
 
 
 def _camera_rows(description: dict[str, Any]) -> list[tuple[str, str]]:

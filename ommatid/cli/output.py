@@ -129,7 +129,7 @@ def print_report(name: str, page: Path | None, report: RunReport, sections: Iter
 
     name : of the scene;  page : its report.html, None without one;  sections : its tables
     """
-    from ommatid.pipeline.sections import summary_lines, verdict_line
+    from ommatid.reconstruct.output.facts import summary_lines, verdict_line
     from ommatid.reconstruct.output.verdict_words import is_trusted
 
     if detail == "table":

@@ -118,8 +118,8 @@ def _reconstruct_one(
     strict: bool,
 ) -> None:
     """Reconstruct one stack into a folder or a file, and print the result; None for `detail`: as JSON."""
-    from ommatid.analysis import run_table
     from ommatid.pipeline import reconstruction
+    from ommatid.reconstruct.output import facts
     from ommatid.reconstruct.output.estimate_formats import write_formats
     from ommatid.reconstruct.output.verdict_words import is_trusted
 
@@ -136,7 +136,7 @@ def _reconstruct_one(
         output.print_json({"folder" if whole else "file": str(file), **report.plain()})
     else:
         page = file / "report.html" if whole else None
-        output.print_report(str(file), page, report, [(str(file), run_table.rows(report))], detail)
+        output.print_report(str(file), page, report, [(str(file), facts.rows(report))], detail)
     if strict and not is_trusted(report):
         raise failures.BatchError(failures.NOT_TRUSTED)
 
@@ -179,23 +179,22 @@ class DescribedFrame:
 
 
 def _print_frames(folder: Path, frames: Sequence[DescribedFrame], detail: output.Detail | None) -> None:
-    from ommatid.analysis import run_table
-    from ommatid.pipeline.sections import verdict_line
+    from ommatid.reconstruct.output import facts
 
+    pairs = [(frame.row[0], frame.report) for frame in frames if frame.report is not None]
     if detail is None:
         output.print_json([frame.document for frame in frames])
     elif detail == "verdict":
-        output.print_lines(verdict_line(frame.row[0], frame.report) for frame in frames if frame.report is not None)
+        output.print_lines(facts.verdict_line(*pair) for pair in pairs)
     elif detail == "table":
-        pairs = [(frame.row[0], frame.report) for frame in frames if frame.report is not None]
-        output.print_tables((name, run_table.rows(report)) for name, report in pairs)
+        output.print_tables((name, facts.rows(report)) for name, report in pairs)
     else:
         output.print_tables([(f"{len(frames)} frames: {folder}", [frame.row for frame in frames])])
 
 
 def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict: bool, quiet: bool) -> DescribedFrame:
     """Finish a frame, and return what is printed of it."""
-    from ommatid.analysis.run_table import frame_row
+    from ommatid.reconstruct.output.facts import frame_row
     from ommatid.reconstruct.output.verdict_words import is_trusted
 
     name, heading = frame.output.name, {"file": str(frame.output), "stack": str(frame.stack)}

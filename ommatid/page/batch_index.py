@@ -18,6 +18,7 @@ from markupsafe import Markup
 from ommatid.batch.sweep_row import NUMBERS, SweepRow, read_rows
 from ommatid.batch.sweep_table import PICTURE as SWEEP_PICTURE
 from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output.facts import agreement
 from ommatid.reconstruct.output.result_files import PICTURE
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.output.verdict_words import heading
@@ -32,7 +33,6 @@ from ommatid.scenes.scene import read as read_scene
 
 from .cached import REPORT, read_stamp, sources_digest
 from .panels.charts import ChartAxis, ChartSeries, chart
-from .words import agreement
 
 INDEX = "index.html"
 

@@ -17,7 +17,7 @@ from ommatid.analysis.averaging_kernel import ErrorWindow, error_window
 from ommatid.analysis.next_steps import best_other_type, next_steps
 from ommatid.bench.table import BenchTable
 from ommatid.reconstruct.coarse_model import model_of_f
-from ommatid.reconstruct.output import verdict_words
+from ommatid.reconstruct.output import facts, verdict_words
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
@@ -137,7 +137,7 @@ def _head(run: Run) -> dict[str, Any]:
         "notes": words.notes(report),
         "cautions": words.cautions(report),
         "assumptions": words.assumptions(report),
-        "key_numbers": words.key_numbers(report),
+        "key_numbers": facts.on_topic(report, "error", "quality", "time"),
     }
 
 

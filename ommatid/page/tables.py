@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ommatid.analysis import depth_error, run_table, study
+from ommatid.analysis import depth_error, study
 from ommatid.analysis.lens_table import lens_rows
-from ommatid.analysis.summary import describe, skipped_words
+from ommatid.analysis.summary import describe
+from ommatid.reconstruct.output.facts import facts, samples_of, skipped_words
 from ommatid.reconstruct.output.run_json import RunReport, StageReport
 from ommatid.reconstruct.output.verdict_words import is_trusted
 from ommatid.scenes.camera import Camera
@@ -44,7 +45,7 @@ def stages(run: Run) -> PageTable:
 def _method(name: str, stage: StageReport, run: Run) -> str:
     words = [] if stage.method is None else [stage.method]
     if stage.samples is not None:
-        words.append(run_table.samples_of(stage))
+        words.append(samples_of(stage))
     words += [value for value in (stage.sampler, stage.variant) if value is not None]
     if name == "reconstruct":
         words.append(f"{run.report.solver.method}: {run.report.solver.why}")
@@ -110,13 +111,13 @@ def geometry(scene: Scene, camera: Camera) -> tuple[PageTable, list[tuple[str, s
 
 
 def numbers(run: Run) -> PageTable:
-    """Return the table that `run` prints, without the rows that the page shows elsewhere."""
+    """Return the facts that the page does not show elsewhere."""
     rows = [
-        (name.strip(), value)
-        for name, value in run_table.rows(run.report)
-        if not name.startswith(("left out", "    from "))
+        (fact.name.strip(), fact.words)
+        for fact in facts(run.report)
+        if fact.topic is None and not fact.name.startswith(("left out", "  from "))
     ]
-    return PageTable("All numbers", ("quantity", "value"), rows)
+    return PageTable("Other numbers", ("quantity", "value"), rows)
 
 
 def further(run: Run) -> list[tuple[str, PageTable]]:

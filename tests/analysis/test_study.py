@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ommatid.analysis import run_table, study
+from ommatid.analysis import study
+from ommatid.reconstruct.output import facts
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
@@ -75,7 +76,7 @@ def test_a_misaligned_camera_with_each_estimator() -> None:
     assert sum(fitted.budget().values()) == pytest.approx(fitted.expected.mse, rel=1e-6)
     assert fitted.budget()["misalignment"] > 0
     assert fitted.choice.method == "fit"
-    assert "    from misalignment" in dict(run_table.rows(report_of(stack, model, fitted)))
+    assert "  from misalignment of the lenses" in dict(facts.rows(report_of(stack, model, fitted)))
 
 
 def test_the_deviation_of_a_region_includes_misalignment() -> None:

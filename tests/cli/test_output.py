@@ -39,12 +39,13 @@ def test_six_lines_are_printed_of_a_scene(kept: Path, ommatid: Command) -> None:
     assert len(lines) == 6
     assert lines[0] == f"tiny: not to be trusted: {'; '.join(run['verdict']['reasons'])}"
     assert [line.split()[0] for line in lines[1:]] == ["error", "quality", "limit", "time", "page"]
-    assert f"{sqrt(error['mse']):.3g} grey levels RMS (MSE {error['mse']:.4g})" in lines[1]
     given = error["expected_given_truth"]
-    assert f"expected {sqrt(given['mse']):.3g} (MSE {given['mse']:.4g}, 99 %: {given['low']:.4g} to" in lines[1]
-    assert f"PSNR {error['psnr']:.1f} dB, SSIM {error['ssim']:.4f}; {-error['gain']:.1f} dB worse than" in lines[2]
-    assert f"({baseline['sub_imager']}: PSNR {baseline['psnr']:.1f} dB" in lines[2]
-    assert f" {sum(stage['seconds'] for stage in run['stages'].values()):.1f} s: render " in lines[4]
+    assert f"RMS error {sqrt(error['mse']):.3g} grey levels (expected {sqrt(given['mse']):.3g})" in lines[1]
+    assert f"MSE {error['mse']:.4g} (expected {given['mse']:.4g}, 99 %: {given['low']:.4g} to" in lines[1]
+    assert f"PSNR {error['psnr']:.1f} dB (single sub-image: {baseline['psnr']:.1f} dB)" in lines[2]
+    assert f"SSIM {error['ssim']:.4f} (single sub-image: {baseline['ssim']:.4f})" in lines[2]
+    assert f"gain {error['gain']:.1f} dB (over the best sub-image, {baseline['sub_imager']})" in lines[2]
+    assert f" {sum(stage['seconds'] for stage in run['stages'].values()):.1f} s (render " in lines[4]
     assert lines[5].split()[1] == "out/tiny/report.html"
 
 
@@ -55,7 +56,7 @@ def test_quiet_prints_the_verdict_alone_and_verbose_the_table(ommatid: Command) 
     assert (quiet.err, summary.err.count("up to date")) == ("", 4)
     first = next(line for line in verbose.out.splitlines() if "│" in line)
     assert first.startswith("│ verdict")
-    assert "PSNR (peak 255)" in verbose.out
+    assert "predicted MSE (Eq. 5)" in verbose.out
     both = ommatid(*RUN, "-q", "-v")
     assert both.code == 2
     assert "-v and -q" in both.err

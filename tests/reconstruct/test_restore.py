@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ommatid.analysis import run_table
 from ommatid.analysis.calibration_goal import for_stack
+from ommatid.reconstruct.output import facts
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.output.result_files import with_estimator_changes
 from ommatid.reconstruct.output.run_json import FittedNumber
@@ -60,7 +60,7 @@ def test_spurious_information_of_h_is_reported() -> None:
             read(GALLERY / "tile19.toml", ["calibration.samples=1024", "calibration.fit=none"], lenses)
         )
         shares.append(restoration.spurious_information)
-        lines = run_table.rows(report_of(stack, model, restoration))
+        lines = facts.rows(report_of(stack, model, restoration))
         name, words = lines[0]
         assert name == "verdict"
         assert ("spurious information" in words) == bool(lenses)
@@ -156,9 +156,9 @@ def test_without_the_truth_there_is_no_measured_error() -> None:
     blind = restore(stack, model)
     report = report_of(stack, model, blind)
     assert "mse" not in report.plain()["error"]
-    assert run_table.rows(report)
+    assert facts.rows(report)
     open_number = {"exponent": FittedNumber(value=1e-25, log_deviation=1e12)}
     left_open = report.diagnostics.model_copy(update={"fit": open_number})
-    lines = dict(run_table.rows(report.model_copy(update={"diagnostics": left_open})))
-    assert lines["fitted exponent"] == "1e-25, which the stack leaves open"
+    lines = dict(facts.rows(report.model_copy(update={"diagnostics": left_open})))
+    assert lines["fitted exponent"] == "1e-25 (which the stack leaves open)"
     assert report.error.predicted_mse > 0

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ommatid.analysis import run_table
 from ommatid.reconstruct.noise import censored, usable_pixels
+from ommatid.reconstruct.output import facts
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
@@ -51,7 +51,7 @@ def restored(described: Scene) -> Reconstruction:
 
 
 def rows(restoration: Reconstruction, stack: Stack, model: Model) -> dict[str, str]:
-    return dict(run_table.rows(report_of(stack, model, restoration)))
+    return dict(facts.rows(report_of(stack, model, restoration)))
 
 
 def test_dead_pixels_are_left_out_and_counted() -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import sqrt
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +19,7 @@ from ommatid.runtime.printable import printable_label
 from ommatid.scenes.stack import Stack
 
 from . import verdict_words
+from .facts import headline
 from .run_json import RunReport
 
 OVERVIEW = "overview.png"
@@ -63,20 +63,6 @@ def grid(count: int) -> tuple[int, int]:
     """Return rows and columns for a number of panels; the last one is as wide as what is left of its row."""
     rows = max(2, -(-count // MOST_IN_A_ROW))
     return rows, -(-count // rows)
-
-
-def headline(report: RunReport) -> str:
-    """Return the error of a result in one line, against its expectation and the best single sub-image."""
-    error = report.error
-    given = error.expected_given_truth
-    expected = sqrt(error.predicted_mse if given is None else given.mse)
-    if error.mse is None:
-        return f"expected RMS error {expected:.3g} grey levels"
-    words = f"RMS error {sqrt(error.mse):.3g} grey levels, expected {expected:.3g}"
-    gain = error.plain().get("gain")
-    if gain is None:
-        return words
-    return f"{words}; {abs(gain):.1f} dB {'better' if gain >= 0 else 'worse'} than the best single sub-image"
 
 
 def _write_headline(figure: Any, title: str, report: RunReport) -> None:

@@ -10,7 +10,6 @@ import typer
 from . import options, output
 from .options import (
     AllowOutside,
-    Complete,
     Dark,
     Flat,
     FlatValue,
@@ -50,7 +49,6 @@ def calibrate(
     upright: Upright = None,
     sets: Sets = None,
     lens: Lenses = "",
-    complete: Complete = False,
     allow_outside: AllowOutside = False,
     as_json: Json = False,
 ) -> None:
@@ -63,7 +61,7 @@ def calibrate(
     settings = options.acquisition(dark, flat, flat_value, origin, upright)
     value = options.positive("--point-value", point_value)
     recording = point_recording(points or (), more or (), places, value, settings)
-    asked = options.changes(sets, complete, allow_outside), options.lens_names(lens)
+    asked = options.changes(sets, allow_outside), options.lens_names(lens)
     with output.progress_bar("calibrate") as progress:
         model, made, warnings = calibrate_file(scene, file, *asked, recording, progress)
     output.warn_all(warnings)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # Options that are no longer, with what takes their place.
 _TLS = "name the file in Dask's own configuration, as by DASK_DISTRIBUTED__COMM__TLS__"
 WITHDRAWN = {
+    "--complete": "write --set render.complete=true",
     "--tls-ca": f"{_TLS}CA_FILE",
     "--tls-cert": f"{_TLS}CLIENT__CERT",
     "--tls-key": f"{_TLS}CLIENT__KEY",

@@ -44,9 +44,6 @@ Formats = Annotated[
 Lenses = Annotated[
     str, typer.Option("--lens", metavar="NAME,...", help="Use these lens types only; a type named twice is used twice.")
 ]
-Complete = Annotated[
-    bool, typer.Option("--complete", help="Simulate every effect, however small: render.complete=true.")
-]
 AllowOutside = Annotated[
     bool, typer.Option("--allow-outside", help="Let a world name files outside the folder of its own file.")
 ]
@@ -148,10 +145,9 @@ def lens_names(lens: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in lens.split(",")) if lens else ()
 
 
-def changes(sets: list[str] | None, complete: bool = False, allow_outside: bool = False) -> tuple[str, ...]:
-    """Collect the changes of `--set`, `--complete` and `--allow-outside`, in the order in which they apply."""
-    outside = ("--allow-outside",) if allow_outside else ()
-    return (*(sets or ()), *(("render.complete=true",) if complete else ()), *outside)
+def changes(sets: list[str] | None, allow_outside: bool = False) -> tuple[str, ...]:
+    """Collect the changes of `--set` and `--allow-outside`, in the order in which they apply."""
+    return (*(sets or ()), *(("--allow-outside",) if allow_outside else ()))
 
 
 def cluster(scheduler: str) -> Cluster | None:

@@ -12,7 +12,6 @@ from . import failures, output
 from .options import (
     SCREEN,
     AllowOutside,
-    Complete,
     DryRun,
     FigureFormats,
     FigureResolution,
@@ -52,7 +51,6 @@ def run(
     scheduler: Scheduler = "",
     workers: Workers = None,
     job: Job = "",
-    complete: Complete = False,
     allow_outside: AllowOutside = False,
     within: Within = "",
     figure_formats: FigureFormats = "",
@@ -74,7 +72,7 @@ def run(
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
     figures = figure_files(figure_formats, figure_resolution)
-    asked = changes(sets, complete, allow_outside), lens_names(lens)
+    asked = changes(sets, allow_outside), lens_names(lens)
     members, job_words = share_of_job(job, batch_members(scenes, folder, sweep, *asked), scheduler)
     output.warn_all(batch_warnings(members))
     if dry_run:
@@ -128,7 +126,6 @@ def render(
     scheduler: Scheduler = "",
     workers: Workers = None,
     job: Job = "",
-    complete: Complete = False,
     allow_outside: AllowOutside = False,
     force: Force = False,
     as_json: Json = False,
@@ -141,7 +138,7 @@ def render(
     def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         return {"file": str(member.folder / "stack.exr"), **description}
 
-    asked = changes(sets, complete, allow_outside), lens_names(lens)
+    asked = changes(sets, allow_outside), lens_names(lens)
     members, job_words = share_of_job(job, batch_members(scenes, folder, sweep, *asked), scheduler)
     output.warn_all(batch_warnings(members))
     check = stages.check_render if force else None

@@ -14,7 +14,6 @@ from . import options, output
 from .options import (
     SCREEN,
     AllowOutside,
-    Complete,
     FigureFormats,
     FigureResolution,
     Json,
@@ -41,7 +40,6 @@ def show(
     scene: SceneFile,
     sets: Sets = None,
     lens: Lenses = "",
-    complete: Complete = False,
     allow_outside: AllowOutside = False,
     figure: FigureFile = None,
     figure_formats: FigureFormats = "",
@@ -54,7 +52,7 @@ def show(
     from ommatid.scenes.formats.picture import conversions
     from ommatid.scenes.scene import read
 
-    described = read(scene, options.changes(sets, complete, allow_outside), options.lens_names(lens))
+    described = read(scene, options.changes(sets, allow_outside), options.lens_names(lens))
     output.warn_all(conversions(described))
     description = describe_scene(described)
     if figure is not None:

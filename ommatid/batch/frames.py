@@ -209,6 +209,7 @@ def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunR
     outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, prepared=prepared)
     report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
     clear_formats(frame.output)
+    frame.output.unlink(missing_ok=True)
     result_files.write_picture(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
     result_files.write_estimate(frame.output, outcome, result_files.record_of(report))
     write_formats(frame.output, options.formats)

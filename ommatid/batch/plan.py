@@ -15,7 +15,7 @@ from typing import Any
 from ommatid.analysis import summary
 from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY, allowed_memory, choose_method
-from ommatid.reconstruct.output.result_files import ESTIMATE, fingerprint_of, read_report
+from ommatid.reconstruct.output.result_files import fingerprint_of, read_results, truth_beside
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
@@ -90,8 +90,8 @@ def _states(folder: Path, setup: Setup) -> dict[str, str]:
             return states
         states["calibrate"] = CURRENT
         if recorded.scene.plain() == setup.resolved.plain():
-            same = read_report(folder / ESTIMATE).fingerprint == fingerprint_of(recorded, model)
-            states["reconstruct"] = CURRENT if same else TO_MAKE
+            current = fingerprint_of(recorded, model, truth_beside(folder / "stack.exr", recorded))
+            states["reconstruct"] = CURRENT if read_results(folder)[1] == current else TO_MAKE
     return states
 
 

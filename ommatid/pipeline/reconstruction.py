@@ -19,7 +19,7 @@ from ommatid.page.cached import REPORT, cached_page
 from ommatid.reconstruct.output import result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture, clear_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
-from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport, with_stage
+from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport, of_stages
 from ommatid.reconstruct.restore import check_camera
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
@@ -149,12 +149,10 @@ def finish_folder(
     )
     report = _with_design(report, recorded.scene)
     earlier = earlier_report(folder, report.fingerprint)
-    if earlier is not None:
-        beside = {name: value for name in ("study", "depth") if (value := getattr(earlier, name))}
-        report = report.with_changes(**beside)
-        report = with_stage(report, "study", earlier.stages["study"].seconds) if "study" in earlier.stages else report
-    if not report.study:
+    if made:
         remove_study(folder)
+    elif earlier is not None:  # of a run, which says more
+        report = of_stages(earlier)
     files = max(perf_counter() - begun - report.stages["reconstruct"].seconds, 0.0)
     results = StageResults(report, recorded, calibrated, made, files)
     return finish(results, folder, SILENT), made
@@ -186,8 +184,13 @@ def _write_page(folder: Path) -> None:
     """Write the page of a finished run."""
     from ommatid.simulate.ideal import matrix_as_designed
 
-    report, recorded = run_json.read(folder), stack_file.read(folder / STACK)
-    cached_page(folder, report, partial(matrix_as_designed, recorded.camera), recorded)
+    report = run_json.read(folder)
+    recorded, calibrated = stack_file.read(folder / STACK), model_file.read(folder / MODEL)
+    regions = [(region.corner, region.size) for region in report.regions]
+    truth = result_files.truth_beside(folder / STACK, recorded)
+    if report.fingerprint != result_files.fingerprint_of(recorded, calibrated, truth, regions):
+        raise InputError(f"{folder}: run.json is of another stack or model than those beside it; run the scene again")
+    cached_page(folder, report, partial(matrix_as_designed, recorded.camera), recorded, calibrated)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Runs within a given time: two runs with few samples, then one with as many as the rest of the time allows.
 
-All of them are ordinary runs in the scene's own folder, so that it holds complete results whatever happens.
+All of them are ordinary runs in the scene's own folder but for page and run.json, which follow the last one: after an
+interruption the next command goes on from what is there.
 """
 
 from __future__ import annotations

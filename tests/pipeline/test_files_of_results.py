@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import tifffile
 from ommatid.analysis import study
 from ommatid.batch.remote import RunObserver, carry_out, packed, unpack
 from ommatid.batch.sweep_row import read_rows
-from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output import result_files, run_json
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats import exr
 from ommatid.scenes.scene import read
@@ -266,3 +267,46 @@ def test_a_picture_that_was_cut_short_is_made_again(name: str, kept: Path, ommat
     (kept / name).write_bytes(whole[:200])
     assert ommatid(*RUN).code == 0
     assert (kept / name).read_bytes() == whole
+
+
+# --- results of two runs
+
+
+def test_a_run_that_is_killed_between_its_files_leaves_nothing_of_two_results(
+    kept: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = {name: (kept / name).read_bytes() for name in ("estimate.png", "overview.png")}
+    with monkeypatch.context() as patched:
+        patched.setattr(result_files, "write_estimate", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        assert ommatid(*RUN, *CHANGED).code == 1
+    assert (kept / "estimate.png").read_bytes() != whole["estimate.png"]
+    assert not (kept / "estimate.exr").exists()
+    assert ommatid(*RUN).code == 0
+    assert {name: (kept / name).read_bytes() for name in whole} == whole
+
+
+def test_a_page_of_results_of_two_runs_is_refused(kept: Path, ommatid: Command) -> None:
+    assert ommatid("render", "tiny.toml", "-o", "out", "--set", "render.seed=5").code == 0
+    result = ommatid("report", kept)
+    assert (result.code, "run.json is of another stack or model" in result.err) == (2, True)
+
+
+def test_a_truth_that_is_known_later_counts(finished: Path, here: Path, ommatid: Command) -> None:
+    (here / "recorded").mkdir()
+    for name in ("stack.exr", "model.npz"):
+        shutil.copy(finished / name, here / "recorded")
+    command = "reconstruct", "recorded/stack.exr", "recorded/model.npz", "-o", "result", "-q"
+    assert ommatid(*command).code == 0
+    assert run_json.read(here / "result").error.mse is None
+    shutil.copy(finished / "truth.exr", here / "recorded")
+    assert ommatid(*command).code == 0
+    assert run_json.read(here / "result").error.mse == run_json.read(finished).error.mse
+
+
+def test_the_page_of_a_run_keeps_what_the_run_said(kept: Path, ommatid: Command) -> None:
+    document = json.loads((kept / "run.json").read_text(encoding="utf-8"))
+    document["spent"] |= {"within": 9.0, "chosen": {"render.samples": 16}}
+    (kept / "run.json").write_text(json.dumps(document), encoding="utf-8")
+    assert ommatid("report", kept / "stack.exr").code == 0
+    spent = run_json.read(kept).spent
+    assert (spent.within, spent.chosen) == (9.0, {"render.samples": 16})

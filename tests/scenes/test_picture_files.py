@@ -233,6 +233,19 @@ def test_a_strip_is_not_inflated_beyond_its_pixels(compression: str, packed: byt
     assert "damaged" in refusal(tmp_path / "a.tif")
 
 
+@pytest.mark.parametrize("options", [{"tile": (16, 32)}, {"tile": (16, 32), "compression": "lzw"}, {"rowsperstrip": 5}])
+def test_a_missing_strip_or_tile_is_no_black_one(options: dict[str, Any], tmp_path: Path) -> None:
+    """tifffile fills it with zeros."""
+    path = save_tiff(tmp_path / "a.tif", np.full((37, 53), 99, np.uint8), **options)
+    with tifffile.TiffFile(path) as file:
+        tag = cast(Any, file.pages[0]).tags["TileByteCounts" if "tile" in options else "StripByteCounts"]
+        offset, code = tag.valueoffset, {3: "<H", 4: "<I"}[int(tag.dtype)]
+    content = bytearray(path.read_bytes())
+    content[offset : offset + struct.calcsize(code)] = struct.pack(code, 0)
+    path.write_bytes(content)
+    assert "damaged" in refusal(path)
+
+
 def save_tiff(path: Path, pixels: NDArray[Any], **options: Any) -> Path:
     WRITE_TIFF(path, pixels, **{"photometric": "minisblack", "metadata": None, **options})
     return path

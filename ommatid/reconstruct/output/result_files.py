@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -134,10 +135,12 @@ def write_picture(path: Path, estimate: FloatArray) -> None:
 def write_results(folder: Path, stack: Stack, restoration: Reconstruction, report: RunReport) -> None:
     """Write the estimate and its pictures, the estimate last: where it is, all are there. Raises MachineError.
 
-    The report of an earlier result is removed first, and its estimate in other formats.
+    Those of an earlier result are removed first, so that nothing of two results is ever in a folder.
     """
-    for path in (folder / RUN, *(format_file(folder / ESTIMATE, name) for name in ("npy", "tiff16"))):
-        path.unlink(missing_ok=True)
+    for name in (RUN, ESTIMATE):
+        (folder / name).unlink(missing_ok=True)
+    for name in ("npy", "tiff16"):
+        format_file(folder / ESTIMATE, name).unlink(missing_ok=True)
     write_picture(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
     write_overview(folder, stack, maps_of(restoration), report)
     write_estimate(folder / ESTIMATE, restoration, record_of(report))
@@ -150,18 +153,21 @@ def record_of(report: RunReport) -> dict[str, Any]:
 
 def read_report(path: Path) -> RunReport:
     """Read the report in an estimate's file. Raises InputError for another file, ValueError or KeyError without one."""
-    return RunReport.model_validate(read_estimate(path).record["report"])
+    report = RunReport.model_validate(read_estimate(path).record["report"])
+    json.dumps(report.plain(), allow_nan=False)  # as run.json is written
+    return report
 
 
-def fingerprint_of(stack: Stack, model: Model) -> str:
-    """Fingerprint of everything that an estimate depends on."""
+def fingerprint_of(stack: Stack, model: Model, truth: FloatArray | None, regions: Sequence[Region] = ()) -> str:
+    """Fingerprint of everything that a result depends on; truth : the target, None if it is not known."""
     entries = () if model.stored is None else (model.stored.data, model.stored.indices, model.stored.indptr)
     fitted = () if model.fitted is None else model.fitted.determining
     arrays = (stack.values, stack.variance, *entries, model.variance, model.batches, *fitted)
-    return fingerprint([digest(*arrays), [stack.record, model.record], stack.scene.plain()])
+    of_estimate = fingerprint([digest(*arrays), [stack.record, model.record], stack.scene.plain(), truth is not None])
+    return fingerprint([of_estimate, regions]) if regions else of_estimate
 
 
-def _read_results(folder: Path) -> tuple[RunReport, str | None]:
+def read_results(folder: Path) -> tuple[RunReport, str | None]:
     """Return the report of the estimate in a folder, and its fingerprint if the pictures beside it are whole."""
     report = read_report(folder / ESTIMATE)
     return report, report.fingerprint if all(_is_whole(folder / name) for name in (PICTURE, OVERVIEW)) else None
@@ -195,12 +201,12 @@ def cached_results(
     force: bool = False,
 ) -> tuple[RunReport, bool]:
     """Return the report of the estimate in a folder, and True if it was made: if needed, or by `force`."""
-    current = fingerprint_of(stack, model)
-    current = fingerprint([current, regions]) if regions else current
+    truth = truth_beside(names[0], stack)
+    current = fingerprint_of(stack, model, truth, regions)
 
     def make() -> tuple[Reconstruction, RunReport]:
-        restoration, report = reconstruct(stack, model, truth_beside(names[0], stack), names, workers, progress)
+        restoration, report = reconstruct(stack, model, truth, names, workers, progress)
         added = {"fingerprint": current, **origin(), **region_reports(restoration, regions)}
         return restoration, report.with_changes(**added)
 
-    return cached(folder, current, _read_results, make, lambda _, made: write_results(folder, stack, *made), force)
+    return cached(folder, current, read_results, make, lambda _, made: write_results(folder, stack, *made), force)

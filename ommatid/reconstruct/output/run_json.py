@@ -42,7 +42,7 @@ def time_spent(stages: Mapping[str, StageReport], error: ErrorReport, *, calibra
     better, most of all where much of its error is in components that the lens types hardly measure.
     """
     seconds = {name: stage.seconds for name, stage in stages.items()}
-    parts = [error.budget[part] for part in STAGES.values()]
+    parts = [error.budget.get(part, 0.0) for part in STAGES.values()]
     rest, total = max(error.predicted_mse - sum(parts), 0.0), sum(seconds.values())
     sampler = stages["render"].sampler
     if sampler is None:  # recorded frames
@@ -76,10 +76,10 @@ def of_stages(report: RunReport) -> RunReport:
 def with_times(report: RunReport, files: float, page: float, start_up: float | None) -> RunReport:
     """Return the report of stages with the times of what surrounds them, in seconds."""
     complete = with_stage(with_stage(report, FILES, files), PAGE, page)
-    if start_up is None:
-        return complete
-    spent = TimeReport.model_validate({**complete.spent.plain(), "start_up": start_up})
-    return complete.with_changes(spent=spent)
+    changes: dict[str, Any] = {} if start_up is None else {"start_up": start_up}
+    if "more" in report.spent.model_fields_set:  # of the stages, which alone take samples
+        changes["more"] = report.spent.more
+    return complete.with_changes(spent=complete.spent.model_copy(update=changes))
 
 
 def _with_stages(report: RunReport, stages: dict[str, StageReport]) -> RunReport:

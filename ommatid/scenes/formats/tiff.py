@@ -150,25 +150,38 @@ def _segment(page: Any) -> int:
 
 
 def _check_segments(stream: BinaryIO, page: Any) -> None:
-    """Raise ValueError if strips or tiles are missing, outside the file, or inflate to more than belongs to them."""
+    """Raise ValueError if a strip or tile is missing, outside the file, or not as long as its pixels."""
     import imagecodecs
 
-    size, stored = stream.seek(0, io.SEEK_END), 0
+    size = stream.seek(0, io.SEEK_END)
     offsets, counts = list(page.dataoffsets), list(page.databytecounts)
-    most = _segment(page)
-    if len(offsets) != len(counts) or len(offsets) < prod(page.chunked):
+    expected = list(_lengths(page))
+    if not len(offsets) == len(counts) == len(expected):
         raise ValueError("some of its strips are missing")
     decode: Any = None if page.compression == UNCOMPRESSED else getattr(imagecodecs, DECODERS[page.compression])
-    for offset, count in zip(offsets, counts, strict=True):
+    for offset, count, needed in zip(offsets, counts, expected, strict=True):
         if offset + count > size:
             raise ValueError("it is cut short")
         stream.seek(offset)
+        most = _segment(page)
         length = count if decode is None else len(decode(stream.read(count), out=min(most, EXPANSION * count) + 1))
+        if length < needed:
+            raise ValueError("it is cut short")
         if decode is not None and length > most:
             raise ValueError("a strip has more than its pixels")
-        stored += length
-    if 8 * stored < prod(page.shape) * page.bitspersample:
-        raise ValueError("it is cut short")
+
+
+def _lengths(page: Any) -> Iterator[int]:
+    """Yield the bytes of every strip or tile: tiles are whole, the last strip of a plane may have fewer rows."""
+    planes = int(page.samplesperpixel) if int(page.planarconfig) != 1 else 1
+    of_pixel = int(page.bitspersample) * (int(page.samplesperpixel) // planes)
+    if page.is_tiled:
+        width, rows = int(page.tilewidth), int(page.tilelength)
+        yield from [-(-width * of_pixel // 8) * rows] * prod(page.chunked)
+        return
+    width, rows, left = int(page.imagewidth), int(page.rowsperstrip), int(page.imagelength)
+    lines = [min(rows, left - first) for first in range(0, left, rows)]
+    yield from [-(-width * of_pixel // 8) * each for each in lines] * planes
 
 
 def _page(page: Any) -> StoredPicture:

@@ -102,6 +102,17 @@ def ran(folder: Path, name: str, *changes: str) -> RunReport:
 # --- sentences of the pages
 
 
+def test_the_best_camera(ommatid: Command) -> None:
+    magnifications = 'design.magnifications="1/3,1/4,...,1/9"'
+    found = json.loads(ommatid("design", "tile19", "--set", magnifications, "--json").out)
+    check_figures("camera.md", "has a mean squared error below {} far from the edges.", found["bound"])
+    areas = found["mixture"]["arrays"][:3]
+    check_figures("camera.md", "takes {} arrays of 1/3, {} of 1/4 and {} of 1/5.", *areas)
+    best = found["cameras"][0]
+    assert best["arrays"] == [1, 1, 1, 0, 0, 0, 0]
+    check_figures("camera.md", "the best camera is the paper's, {} % above the bound.", 100 * best["above"])
+
+
 def test_the_photograph_of_the_readme() -> None:
     camera = camera_of("photo")
     check_figures("README.md", "it shows {} pixels reconstructed from fifty", camera.unknowns)

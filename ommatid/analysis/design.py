@@ -72,7 +72,7 @@ def _null_space(prediction: Prediction, before: str) -> str:
     return f"{before}null space of {prediction.null_space} dimensions" if known else ""
 
 
-def magnifications(text: str) -> list[Fraction]:
+def magnifications(text: str, where: str = "--candidates") -> list[Fraction]:
     """Read "1/2,1/3,...,1/9": ratios above 0 and up to 1; dots continue the step of the two 1/magnifications before.
 
     Raises InputError that names what cannot be read.
@@ -81,11 +81,11 @@ def magnifications(text: str) -> list[Fraction]:
     ratios: list[Fraction] = []
     for index, part in enumerate(parts):
         if part != "...":
-            ratios.append(_magnification(part))
+            ratios.append(_magnification(part, where))
             continue
         if len(ratios) < 2 or index + 1 == len(parts):
-            raise InputError('--candidates: "..." needs two ratios before it and one after it, as in 1/2,1/3,...,1/9')
-        ratios += _between(ratios[-2], ratios[-1], _magnification(parts[index + 1]))
+            raise InputError(f'{where}: "..." needs two ratios before it and one after it, as in 1/2,1/3,...,1/9')
+        ratios += _between(ratios[-2], ratios[-1], _magnification(parts[index + 1], where), where)
     return list(dict.fromkeys(ratios))
 
 
@@ -107,23 +107,21 @@ def with_lens(scene: Scene, magnification: Fraction) -> Scene:
     return parse({**data, "camera": camera}, scene.source)
 
 
-def _between(before: Fraction, last: Fraction, end: Fraction) -> list[Fraction]:
+def _between(before: Fraction, last: Fraction, end: Fraction, where: str) -> list[Fraction]:
     step = 1 / last - 1 / before
     steps = (1 / end - 1 / last) / step if step else Fraction(-1)
     if steps > MAX_CANDIDATES:
-        raise InputError(
-            f"--candidates: expected at most {MAX_CANDIDATES} magnifications, got {int(steps)} up to {end}"
-        )
+        raise InputError(f"{where}: expected at most {MAX_CANDIDATES} magnifications, got {int(steps)} up to {end}")
     if steps <= 0 or steps.denominator != 1:
-        raise InputError(f"--candidates: steps of {step} in 1/magnification never reach {end} after {last}")
+        raise InputError(f"{where}: steps of {step} in 1/magnification never reach {end} after {last}")
     return [1 / (1 / last + step * number) for number in range(1, int(steps))]
 
 
-def _magnification(text: str) -> Fraction:
+def _magnification(text: str, where: str) -> Fraction:
     try:
         ratio = Fraction(text)
     except (ValueError, ZeroDivisionError):
         ratio = Fraction(0)
     if not 0 < ratio <= 1:
-        raise InputError(f"--candidates: expected magnifications above 0 and at most 1, such as 1/6, got '{text}'")
+        raise InputError(f"{where}: expected magnifications above 0 and at most 1, such as 1/6, got '{text}'")
     return ratio

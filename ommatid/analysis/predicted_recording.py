@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from ommatid.reconstruct.prior import coloured, spectrum_of
+from ommatid.reconstruct.prior import FittedPrior, coloured, spectrum_of
 from ommatid.reconstruct.prior_fit import fit_picture, natural_prior
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -147,7 +147,7 @@ def prior_without_stack(setup: Setup) -> tuple[PriorTable, Assumptions]:
     It is fitted to the scene's picture, and where there is none to read it is that of natural pictures.
     """
     scene, camera = setup.scene, setup.camera
-    if scene.prior.kind != "fit":
+    if scene.prior.kind != "fit" or isinstance(scene.prior, FittedPrior):
         return scene.prior, ()
     fitted = None
     if known_image(setup)[0] is not None:

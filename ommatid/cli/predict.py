@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 SweepFolder = Annotated[
     Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the table and the plot of --sweep.")
 ]
+DesignFolder = Annotated[
+    Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the scene files of the best cameras.")
+]
 NoRays = Annotated[
     bool, typer.Option("--no-rays", help="A perfect H and a perfect rendering for every scene: Eq. 5 without rays.")
 ]
@@ -68,25 +71,38 @@ def predict(
 
 def design(
     scene: SceneFile,
-    candidates: Candidates = "1/2,1/3,...,1/9",
+    candidates: Candidates = "",
     sets: Sets = None,
     lens: Lenses = "",
+    folder: DesignFolder = None,
     as_json: Json = False,
 ) -> None:
-    """Rank lens types that could be added.
+    """Choose lens types, with a bound on every other choice.
 
-    Ranks magnifications by the expected error (Eq. 5) with each.
+    Without --candidates: the best camera of the lens types of [design], with as many readings as the scene's.
+    With it: the expected error (Eq. 5) with one more lens type of each magnification.
     """
+    from ommatid.analysis.best_camera import candidates as candidates_of
     from ommatid.analysis.design import magnifications
-    from ommatid.pipeline.descriptions import compare_lens_types
+    from ommatid.pipeline.descriptions import compare_lens_types, prove_best_camera
     from ommatid.scenes.scene import read
+    from ommatid.scenes.tables.estimation import DesignTable
 
-    wanted = magnifications(candidates)
+    if candidates and folder is not None:
+        raise InputError("design: -o is for the scenes of the best cameras; leave out --candidates, or -o")
+    added = magnifications(candidates) if candidates else []
     described = read(scene, options.changes(sets), options.lens_names(lens))
+    title = described.title or scene.stem
     with output.progress_bar("design") as progress:
-        comparison = compare_lens_types(described, wanted, progress)
-    title = f"{described.title or scene.stem}: the expected error with one more lens type"
-    output.print_result(comparison.describe(), [(title, comparison.rows())], as_json)
+        if candidates:
+            comparison = compare_lens_types(described, added, progress)
+            document, rows = comparison.describe(), comparison.rows()
+            title = f"{title}: the expected error with one more lens type"
+        else:
+            listed = magnifications((described.design or DesignTable()).magnifications, "design.magnifications")
+            document, rows = prove_best_camera(described, candidates_of(described, listed), folder, progress)
+            title = f"{title}: the best camera"
+    output.print_result(document, [(title, rows)], as_json)
 
 
 def _predict_sweep(

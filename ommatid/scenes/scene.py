@@ -23,6 +23,7 @@ from .tables import toml
 from .tables.camera import CameraTable
 from .tables.estimation import (
     CalibrationTable,
+    DesignTable,
     EstimatorTable,
     PriorTable,
     RenderTable,
@@ -88,6 +89,7 @@ class Scene(Table):
     render: RenderTable = RenderTable()
     calibration: CalibrationTable = CalibrationTable()
     study: StudyTable | None = None
+    design: DesignTable | None = Field(default=None, exclude=True)  # changes no run
 
     _source: Path = PrivateAttr(default=Path("scene"))
     _world_copy: Path | None = PrivateAttr(default=None)

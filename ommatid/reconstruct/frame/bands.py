@@ -322,6 +322,25 @@ class Bands:
         noisy = self.noise_of_waves(level, ratios).mean()
         return float(posterior.mean()), float((posterior - expected).mean()), float(noisy)
 
+    def groups(self) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return W^1/2 b_t and a of every group, by waves of variance 1, and the lens type of each row b_t.
+
+        (rows, groups, waves), (groups, waves) and (rows,); without the last groups, which belong to no wave of f.
+        """
+        members = [_members(size, self.detail)[:-1] for size in self.shape]
+        down, across = members[0][:, None, :, None], members[1][None, :, None, :]
+        missing = (down < 0) | (across < 0)
+
+        def by_group(waves: FloatArray) -> FloatArray:
+            values = np.where(missing, 0.0, waves[down, across])
+            return values.reshape(self.shape[0] * self.shape[1], self.detail**2)
+
+        root = np.sqrt(self.spectrum)
+        rows = [by_group(root * row) for row in self._rows]
+        weighted = np.sqrt(self._of_rows(self.weights))[:, None, None] * np.array(rows)
+        types = self._of_rows(range(len(self.types))).astype(np.int64)
+        return weighted, by_group(root * self._pixels), types
+
     def noise_of_waves(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
         """Return the variance of each wave of f's pixels by noise, as of `variances`: (rows, columns)."""
         gain = np.einsum("ijtu,iju->ijt", self._of_pixels[1], self._along_vectors(level))

@@ -1,4 +1,4 @@
-"""The tables of computations in the scene file: [render], [calibration], [prior], [estimator], [tiles] and [study]."""
+"""The tables of computations in the scene file: [render] to [study], and [design]."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Literal, cast
 from pydantic import BeforeValidator, Field, model_validator
 
 from .table import LARGEST, Table
-from .units import AUTO, ExpectedNoise, Length, Memory, Samples, Time, pair
+from .units import AUTO, ExpectedNoise, FillFactor, Length, Memory, Samples, Time, pair
 
 Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
 WITHOUT_NOISE = 256  # samples where there is no noise that "auto" could compare with
@@ -204,6 +204,28 @@ class StudyTable(Table):
     ] = Field(
         description="ideal: as designed; points, transport: calibrated; fitted: to the stack; true: with the"
         " misalignment that was drawn"
+    )
+
+
+class DesignTable(Table):
+    """Lens types from which `ommatid design` chooses a camera: every magnification, aperture and fill factor."""
+
+    magnifications: str = Field(
+        default="1/2,1/3,...,1/9",
+        max_length=1000,
+        description="of lens types; dots continue the step of the two 1/magnifications before them",
+    )
+    apertures: Annotated[tuple[Length, ...], BeforeValidator(pair)] = Field(
+        default=(), max_length=20, description="diameters of the lenses; absent: that of the last lens type"
+    )
+    fill_factors: Annotated[tuple[FillFactor, ...], BeforeValidator(pair)] = Field(
+        default=(), max_length=20, description="open parts of the pixels; absent: that of the last lens type"
+    )
+    readings: float | None = Field(
+        default=None,
+        gt=0,
+        le=1000,
+        description="readings per pixel of f, of all lens types together; absent: those of the camera",
     )
 
 

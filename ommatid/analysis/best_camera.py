@@ -1,0 +1,265 @@
+"""The camera of least expected error that can be made of given lens types, and a bound on that of every other.
+
+Errors are those of Eq. 5 far from the edges, by transfer functions, with a perfect H and a perfect rendering.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import product
+from math import ceil
+from typing import Any
+
+import numpy as np
+
+from ommatid.reconstruct.assumptions import assumptions_at
+from ommatid.reconstruct.frame.bands import Bands
+from ommatid.reconstruct.frame.conjugate_gradients import frame_system
+from ommatid.reconstruct.method_choice import MethodChoice
+from ommatid.reconstruct.methods.method import Execution
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.machine import one_thread
+from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.constants import MOST_DENSE
+from ommatid.scenes.scene import Scene, parse, with_tables
+from ommatid.scenes.setup import Setup
+from ommatid.scenes.tables.estimation import DesignTable
+
+from .mixture import PART, Evaluation, Mixture, WaveGroups, WholeMixture, best_mixture, best_whole
+from .predicted_recording import prior_without_stack, recording_without_rays
+
+OPTICS = ("aperture", "focus", "distortion", "surfaces", "scale", "fill_factor")  # copied from the last lens type
+SIDE, FINE_SIDE = 119, 59  # pixels of f of the square whose waves are summed; of one in front of a finer world
+LARGEST = 2**16  # pixels of a target whose own waves are summed
+MOST_CANDIDATES = 200
+SHOWN = 3  # cameras of whole arrays
+
+
+@dataclass(frozen=True)
+class LensCandidate:
+    """A lens type of a magnification, and of an aperture (mm) and open part where these are not the last type's."""
+
+    ratio: Fraction
+    aperture: float | None = None
+    open: tuple[Fraction, Fraction] | None = None
+
+    @property
+    def side(self) -> int:
+        """Sub-imagers along a side of an array, which sees every pixel of f."""
+        return ceil(self.ratio)
+
+    @property
+    def readings(self) -> float:
+        """Readings of an array per pixel of f."""
+        return float((self.side / self.ratio) ** 2)
+
+    @property
+    def words(self) -> str:
+        """The type as tables name it."""
+        words = [str(1 / self.ratio)]
+        words += [] if self.aperture is None else [f"{self.aperture:g} mm"]
+        if self.open is not None:
+            words.append(f"open {' x '.join(str(part) for part in dict.fromkeys(self.open))}")
+        return " ".join(words)
+
+    def table(self, last: dict[str, Any], name: str) -> dict[str, Any]:
+        """Return the type as a table of a scene; last : the scene's last lens type, whose optics it takes."""
+        optics = {key: last[key] for key in OPTICS if key in last}
+        if self.aperture is not None:
+            optics["aperture"] = f"{self.aperture!r} mm"
+        if self.open is not None:
+            optics["fill_factor"] = [str(part) for part in self.open]
+        array = [self.side, self.side]
+        return {**optics, "name": name, "magnification": str(1 / self.ratio), "array": array, "pixels": "fit"}
+
+
+@dataclass(frozen=True)
+class BestCamera:
+    """The best mixture of lens types, the best cameras of whole arrays, and the scene's own camera.
+
+    readings : per pixel of f;  own : arrays of the scene's camera and their error, None where it has other arrays
+    refused : lens types that the camera cannot have, with the reason
+    """
+
+    types: tuple[LensCandidate, ...]
+    readings: float
+    mixture: Mixture
+    whole: tuple[WholeMixture, ...]
+    own: tuple[tuple[float, ...], Evaluation] | None
+    refused: tuple[tuple[str, str], ...]
+
+    def above(self, error: float) -> float:
+        """Return by how much an error exceeds the bound, relative to it."""
+        return error / self.mixture.bound - 1
+
+
+def candidates(scene: Scene, magnifications: Sequence[Fraction]) -> list[LensCandidate]:
+    """Return every magnification with every aperture and fill factor of [design]. Raises InputError for very many."""
+    table, last = scene.design or DesignTable(), derive(scene).types[-1]
+    apertures = [None if each == last.optics.aperture else each for each in table.apertures] or [None]
+    opened = [None if each == last.open else each for each in table.fill_factors] or [None]
+    found = [LensCandidate(1 / each, width, part) for each, width, part in product(magnifications, apertures, opened)]
+    if len(found) > MOST_CANDIDATES:
+        raise InputError(f"design: expected at most {MOST_CANDIDATES} lens types, got {len(found)}; name fewer")
+    return found
+
+
+def best_camera(scene: Scene, wanted: Sequence[LensCandidate]) -> BestCamera:
+    """Choose among lens types and the scene's own. Raises InputError without a bound, and as a prediction does."""
+    camera = derive(scene)
+    _check(scene, camera)
+    own = _own_arrays(camera)
+    types, refused = list[LensCandidate](), list[tuple[str, str]]()
+    for candidate in sorted({*own, *wanted}, key=lambda each: (each.ratio, each.aperture or 0.0, each.open or ())):
+        try:
+            derive(scene_of(scene, [candidate]))
+            types.append(candidate)
+        except InputError as error:
+            refused.append((candidate.words, str(error).removeprefix(f"{scene.source}: ")))
+    if not types:
+        raise InputError(f"{scene.source}: no lens type is possible: {refused[0][0]}: {refused[0][1]}")
+    costs = [each.readings for each in types]
+    own_readings = sum(lens.count / float(lens.ratio) ** 2 for lens in camera.types)
+    readings = own_readings if scene.design is None or scene.design.readings is None else scene.design.readings
+    if readings < min(costs):
+        raise InputError(
+            f"{scene.source}: design.readings: the smallest array takes {min(costs):.3g} readings per pixel of f, got"
+            f" {readings:g}; raise it"
+        )
+    with one_thread():
+        groups = WaveGroups.of(_bands(scene, types), costs)
+        mixture = best_mixture(groups, readings)
+        whole = best_whole(groups, readings, mixture, SHOWN)
+        counts = tuple(float(own[each]) for each in types)
+        evaluated = (counts, groups.evaluate(np.array(counts))) if own else None
+    return BestCamera(tuple(types), readings, mixture, tuple(whole), evaluated, tuple(refused))
+
+
+def scene_of(scene: Scene, types: Sequence[LensCandidate]) -> Scene:
+    """Return the scene with an array of each of these lens types. Raises InputError where the camera is impossible."""
+    tables = scene.plain()
+    last = tables["camera"]["lens"][-1]
+    lenses = [each.table(last, f"L{number}") for number, each in enumerate(types, 1)]
+    return parse({**tables, "camera": {**tables["camera"], "lens": lenses}}, scene.source)
+
+
+def _check(scene: Scene, camera: Camera) -> None:
+    """Raise InputError for a scene whose error no transfer functions give, or whose readings have no noise."""
+    where = str(scene.source)
+    if scene.world is not None:
+        raise InputError(f"{where}: the bound is that of flat targets, got a [world]")
+    if camera.tolerance is not None:
+        raise InputError(f"{where}: the bound is that of lenses in their places, got camera.tolerance; remove it")
+    if not camera.walls or any(lens.optics.distortion is not None for lens in camera.types):
+        raise InputError(f"{where}: the bound is that of lenses that see the same everywhere")
+    if camera.has_surfaces and camera.with_grid_of_matrix.unknowns <= MOST_DENSE:
+        raise InputError(
+            f"{where}: the bound takes lenses with surfaces in front of more than {MOST_DENSE} pixels, got"
+            f" {camera.unknowns}; rank types with --candidates"
+        )
+    if not scene.has_noise:
+        raise InputError(f"{where}: without noise every mixture is exact or has a null space; set noise.variance")
+
+
+def _own_arrays(camera: Camera) -> Counter[LensCandidate]:
+    """Return the arrays of the scene's camera by lens type; nothing if not all are whole and of one optics."""
+    last, found = camera.types[-1], Counter[LensCandidate]()
+    for lens in camera.types:
+        candidate = LensCandidate(lens.ratio)
+        whole = lens.array == (candidate.side, candidate.side) and not lens.steered and lens.is_sliding
+        if not whole or (lens.optics, lens.open) != (last.optics, last.open):
+            return Counter()
+        found[candidate] += 1
+    return found
+
+
+def _bands(scene: Scene, types: Sequence[LensCandidate]) -> Bands:
+    """Return the transfer functions of a camera of all types.
+
+    They are those in front of the scene's target or, where that is small or very large, of a square of pixels whose
+    light is that of images of the prior. What surfaces do varies over the field: they have the scene's target.
+    """
+    camera, side = derive(scene), FINE_SIDE if scene.target.detail > 1 else SIDE
+    prior, _ = prior_without_stack(Setup.from_scene(scene).calibrated)
+    tables, shape = scene.plain(), camera.shape
+    if not camera.has_surfaces and (min(shape) < side or camera.unknowns > LARGEST):
+        tables["target"] = {key: each for key, each in tables["target"].items() if key not in ("image", "origin")}
+        shape = side, side
+        tables["target"]["shape"] = list(shape)
+    width = max((max(shape) + each.ratio) / each.ratio for each in types) * camera.pixel_pitch
+    tables["camera"] = {key: each for key, each in tables["camera"].items() if key not in ("sensor", "lens_pitch")}
+    tables["camera"]["lens_pitch"] = f"{max(float(width), camera.lens_pitch)!r} mm"
+    tables["estimator"] = {**tables.get("estimator", {}), "method": "frame"}
+    square = parse(tables, scene.source)
+    setup = Setup.from_scene(with_tables(scene_of(square, types), prior=prior))
+    recording, choice = recording_without_rays(setup), MethodChoice("frame", "", 0, 0.0)
+    assumed = assumptions_at(recording.stack, recording.model, choice, recording.image, Execution(quick=True))
+    bands = frame_system(assumed.method.task).bands
+    if bands is None:
+        raise InputError(f"{scene.source}: the bound is that of lenses that see the same everywhere")
+    return bands
+
+
+def words_of(amounts: Sequence[float], types: Sequence[LensCandidate]) -> str:
+    """Return amounts of lens types in words: "1/3 + 2 x 1/4", or "1.16 x 1/3 + 1.05 x 1/4"."""
+    named = [(amount, each.words) for amount, each in zip(amounts, types, strict=True) if amount > PART]
+    return " + ".join(words if abs(amount - 1) < PART / 2 else f"{amount:.3g} x {words}" for amount, words in named)
+
+
+def _above(best: BestCamera, error: float) -> str:
+    """Return an error, and how it exceeds the bound."""
+    above = best.above(error)
+    return f"{error:.4g}, {above:.1%} above" if above < 1 else f"{error:.4g}, {above + 1:.3g} times that"
+
+
+def rows(best: BestCamera, with_edges: Sequence[float | str]) -> list[tuple[str, str]]:
+    """Return the proof as rows of a table; with_edges : errors of the cameras of whole arrays, or why there is none."""
+    mixture, types = best.mixture, best.types
+    lines = [
+        (
+            "no camera is better than",
+            f"MSE {mixture.bound:.4g}, of {len(types)} lens types with {best.readings:.3g} readings per pixel of f, far"
+            " from the edges",
+        ),
+        ("best mixture", f"{words_of(mixture.amounts.tolist(), types)}: {mixture.error:.4g}"),
+    ]
+    for number, (each, edges) in enumerate(zip(best.whole, with_edges, strict=True), 1):
+        known = f"{edges:.4g} with edges" if isinstance(edges, float) else edges
+        lines.append(
+            (
+                f"{number}. whole arrays",
+                f"{words_of(each.counts, types)}: {_above(best, each.error)}; {each.information:.3g} bits per pixel;"
+                f" {known}",
+            )
+        )
+    if best.own is not None:
+        counts, found = best.own
+        words = f"{_above(best, found.error)}; {found.information:.3g} bits per pixel"
+        lines.append(("this camera", f"{words_of(counts, types)}: {words}"))
+    return lines + [(f"not {words}", reason) for words, reason in best.refused]
+
+
+def describe(best: BestCamera, with_edges: Sequence[float | str]) -> dict[str, Any]:
+    """Return the proof in JSON's types; with_edges : as of `rows`."""
+    own = best.own and {"arrays": list(best.own[0]), "mse": best.own[1].error, "information": best.own[1].information}
+    return {
+        "types": [each.words for each in best.types],
+        "readings": best.readings,
+        "bound": best.mixture.bound,
+        "mixture": {"arrays": best.mixture.amounts.tolist(), "mse": best.mixture.error, "gap": best.mixture.gap},
+        "cameras": [
+            {
+                "arrays": list(each.counts),
+                "mse": each.error,
+                "above": best.above(each.error),
+                "information": each.information,
+                "with_edges": edges if isinstance(edges, float) else None,
+            }
+            for each, edges in zip(best.whole, with_edges, strict=True)
+        ],
+        "own": own,
+        "refused": dict(best.refused),
+    }

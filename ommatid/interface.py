@@ -152,7 +152,7 @@ def reconstruct(stack: Stack, model: Model, truth: FloatArray | None = None) -> 
     flat = None if truth is None else flat_truth(truth, stack.camera)
     names = Path("the stack"), Path("the model")
     outcome, report = result_files.reconstruct(stack, model, flat, names)
-    report = report.with_changes(fingerprint=result_files.fingerprint_of(stack, model))
+    report = report.with_changes(fingerprint=result_files.fingerprint_of(stack, model, flat))
     return result_of(stack, model, outcome, report)
 
 

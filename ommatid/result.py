@@ -181,6 +181,6 @@ class Reconstructor:
         """Return the fingerprint of everything that an estimate depends on; H is read for the first stack only."""
         if self._model_digest is None:
             nothing = replace(stack, values=stack.values[:0], variance=stack.variance[:0], record={})
-            self._model_digest = result_files.fingerprint_of(nothing, self._model)
+            self._model_digest = result_files.fingerprint_of(nothing, self._model, None)
         pixels = digest(stack.values, stack.variance)
         return fingerprint([self._model_digest, pixels, stack.record, stack.scene.plain()])

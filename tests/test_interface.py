@@ -181,7 +181,7 @@ def test_without_the_truth_nothing_is_measured(
     alone = ommatid.reconstruct(stack, model)
     np.testing.assert_array_equal(alone.image, result.image)
     assert (alone.truth, alone.mse) == (None, None)
-    assert "truth" not in alone._repr_html_()  # pyright: ignore[reportPrivateUsage]
+    assert "<figcaption>truth" not in alone._repr_html_()  # pyright: ignore[reportPrivateUsage]
 
 
 @pytest.mark.slow

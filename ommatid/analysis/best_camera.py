@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
 from math import ceil
@@ -36,6 +36,7 @@ SIDE, FINE_SIDE = 119, 59  # pixels of f of the square whose waves are summed; o
 LARGEST = 2**16  # pixels of a target whose own waves are summed
 MOST_CANDIDATES = 200
 SHOWN = 3  # cameras of whole arrays
+ROUNDING = 1e-9  # of readings
 
 
 @dataclass(frozen=True)
@@ -112,30 +113,30 @@ def best_camera(scene: Scene, wanted: Sequence[LensCandidate]) -> BestCamera:
     camera = derive(scene)
     _check(scene, camera)
     own = _own_arrays(camera)
-    types, refused = list[LensCandidate](), list[tuple[str, str]]()
+    types, refused = list[LensCandidate](), dict[str, str]()
     for candidate in sorted({*own, *wanted}, key=lambda each: (each.ratio, each.aperture or 0.0, each.open or ())):
         try:
             derive(scene_of(scene, [candidate]))
             types.append(candidate)
         except InputError as error:
-            refused.append((candidate.words, str(error).removeprefix(f"{scene.source}: ")))
+            refused[candidate.words] = _reason(scene, error)
     if not types:
-        raise InputError(f"{scene.source}: no lens type is possible: {refused[0][0]}: {refused[0][1]}")
-    costs = [each.readings for each in types]
+        raise InputError(f"{scene.source}: no lens type is possible: {': '.join(next(iter(refused.items())))}")
     own_readings = sum(lens.count / float(lens.ratio) ** 2 for lens in camera.types)
     readings = own_readings if scene.design is None or scene.design.readings is None else scene.design.readings
-    if readings < min(costs):
+    least = min(each.readings for each in types)
+    if readings < least * (1 - ROUNDING):
         raise InputError(
-            f"{scene.source}: design.readings: the smallest array takes {min(costs):.3g} readings per pixel of f, got"
+            f"{scene.source}: design.readings: the smallest array takes {least:.3g} readings per pixel of f, got"
             f" {readings:g}; raise it"
         )
     with one_thread():
-        groups = WaveGroups.of(_bands(scene, types), costs)
+        groups, types, others = _possible(scene, types)
         mixture = best_mixture(groups, readings)
-        whole = best_whole(groups, readings, mixture, SHOWN)
+        whole = best_whole(groups, readings * (1 + ROUNDING), mixture, SHOWN)
         counts = tuple(float(own[each]) for each in types)
-        evaluated = (counts, groups.evaluate(np.array(counts))) if own else None
-    return BestCamera(tuple(types), readings, mixture, tuple(whole), evaluated, tuple(refused))
+        evaluated = (counts, groups.evaluate(np.array(counts))) if own and own.keys() <= set(types) else None
+    return BestCamera(tuple(types), readings, mixture, tuple(whole), evaluated, tuple({**refused, **others}.items()))
 
 
 def scene_of(scene: Scene, types: Sequence[LensCandidate]) -> Scene:
@@ -179,28 +180,71 @@ def _own_arrays(camera: Camera) -> Counter[LensCandidate]:
 def _bands(scene: Scene, types: Sequence[LensCandidate]) -> Bands:
     """Return the transfer functions of a camera of all types.
 
-    They are those in front of the scene's target or, where that is small or very large, of a square of pixels whose
-    light is that of images of the prior. What surfaces do varies over the field: they have the scene's target.
+    They are those in front of the scene's target or, where that is small or very large, of a square of pixels, with the
+    light of the target. What surfaces do varies over the field: they have the scene's target.
     """
     camera, side = derive(scene), FINE_SIDE if scene.target.detail > 1 else SIDE
-    prior, _ = prior_without_stack(Setup.from_scene(scene).calibrated)
-    tables, shape = scene.plain(), camera.shape
-    if not camera.has_surfaces and (min(shape) < side or camera.unknowns > LARGEST):
-        tables["target"] = {key: each for key, each in tables["target"].items() if key not in ("image", "origin")}
-        shape = side, side
-        tables["target"]["shape"] = list(shape)
+    if camera.has_surfaces or (min(camera.shape) >= side and camera.unknowns <= LARGEST):
+        return _bands_and_weights(scene, scene, types, camera.shape)[0]
+    tables = scene.plain()
+    tables["target"] = {key: each for key, each in tables["target"].items() if key not in ("image", "origin")}
+    square = parse({**tables, "target": {**tables["target"], "shape": [side, side]}}, scene.source)
+    bands, weights = _bands_and_weights(square, scene, types, (side, side))
+    if scene.sensor is None:
+        return bands
+    _, own = _bands_and_weights(scene, scene, types, camera.shape)
+    actual = [each * here / there for each, here, there in zip(bands.weights, own, weights, strict=True)]
+    return replace(bands, weights=tuple(actual))
+
+
+def _bands_and_weights(
+    scene: Scene, original: Scene, types: Sequence[LensCandidate], shape: tuple[int, int]
+) -> tuple[Bands, list[float]]:
+    """Return the transfer functions in front of a target of some shape, and the mean weight of each type's readings.
+
+    original : the scene whose prior it is
+    """
+    camera, tables = derive(original), scene.plain()
+    prior, _ = prior_without_stack(Setup.from_scene(original).calibrated)
     width = max((max(shape) + each.ratio) / each.ratio for each in types) * camera.pixel_pitch
     tables["camera"] = {key: each for key, each in tables["camera"].items() if key not in ("sensor", "lens_pitch")}
     tables["camera"]["lens_pitch"] = f"{max(float(width), camera.lens_pitch)!r} mm"
     tables["estimator"] = {**tables.get("estimator", {}), "method": "frame"}
-    square = parse(tables, scene.source)
-    setup = Setup.from_scene(with_tables(scene_of(square, types), prior=prior))
+    setup = Setup.from_scene(with_tables(scene_of(parse(tables, scene.source), types), prior=prior))
     recording, choice = recording_without_rays(setup), MethodChoice("frame", "", 0, 0.0)
-    assumed = assumptions_at(recording.stack, recording.model, choice, recording.image, Execution(quick=True))
-    bands = frame_system(assumed.method.task).bands
+    task = assumptions_at(recording.stack, recording.model, choice, recording.image, Execution(quick=True)).method.task
+    bands = frame_system(task).bands
     if bands is None:
         raise InputError(f"{scene.source}: the bound is that of lenses that see the same everywhere")
-    return bands
+    weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
+    return bands, [float(weights[rows].mean()) for rows in setup.camera.type_slices()]
+
+
+def _possible(scene: Scene, types: Sequence[LensCandidate]) -> tuple[WaveGroups, list[LensCandidate], dict[str, str]]:
+    """Return the groups of all types of which there are any, these types, and why the others have none.
+
+    Raises InputError if none has.
+    """
+    refused: dict[str, str] = {}
+    try:
+        return WaveGroups.of(_bands(scene, types), [each.readings for each in types]), list(types), refused
+    except InputError as error:
+        if len(types) == 1:
+            raise InputError(f"{scene.source}: {types[0].words}: {_reason(scene, error)}") from error
+    kept: list[LensCandidate] = []
+    for each in types:
+        try:
+            _bands(scene, [each])
+            kept.append(each)
+        except InputError as error:
+            refused[each.words] = _reason(scene, error)
+    if not kept:
+        raise InputError(f"{scene.source}: no lens type is possible: {': '.join(next(iter(refused.items())))}")
+    return WaveGroups.of(_bands(scene, kept), [each.readings for each in kept]), kept, refused
+
+
+def _reason(scene: Scene, error: InputError) -> str:
+    return str(error).removeprefix(f"{scene.source}: ")
 
 
 def words_of(amounts: Sequence[float], types: Sequence[LensCandidate]) -> str:
@@ -220,9 +264,9 @@ def rows(best: BestCamera, with_edges: Sequence[float | str]) -> list[tuple[str,
     mixture, types = best.mixture, best.types
     lines = [
         (
-            "no camera is better than",
-            f"MSE {mixture.bound:.4g}, of {len(types)} lens types with {best.readings:.3g} readings per pixel of f, far"
-            " from the edges",
+            "no such camera is better than",
+            f"MSE {mixture.bound:.4g}: {len(types)} lens types, {best.readings:.3g} readings per pixel of f, windows on"
+            " whole pixels, far from the edges",
         ),
         ("best mixture", f"{words_of(mixture.amounts.tolist(), types)}: {mixture.error:.4g}"),
     ]

@@ -1,7 +1,7 @@
 """The mixture of lens types of least error, and a bound on the error of every other.
 
-With x_t arrays of the lens types t, the expected error of a pixel far from the edges (Eq. 5) is the mean over groups of
-waves (`bands`) of
+With x_t arrays of the lens types t, whose windows stand one pixel of f apart, the expected error of a pixel far from
+the edges (Eq. 5) is the mean over groups of waves (`bands`) of
 
     e(x) = a^T (P^-1 + sum_t x_t w_t b_t b_t^T)^-1 a,
 
@@ -140,12 +140,11 @@ def best_whole(groups: WaveGroups, readings: float, start: Mixture, most: int) -
             known[counts] = WholeMixture(counts, found.error, found.information)
         return known[counts].error
 
-    left = readings * (1 + 1e-9)
     counts = tuple(int(part) for part in np.floor(start.amounts + PART))
-    while larger := list(_more(counts, groups.costs, left)):
+    while larger := list(_more(counts, groups.costs, readings)):
         counts = min(larger, key=error)
     for _ in range(MOST_ROUNDS):
-        best = min(_exchanged(counts, groups.costs, left), key=error, default=counts)
+        best = min(_exchanged(counts, groups.costs, readings), key=error, default=counts)
         if not any(counts) or error(best) >= error(counts):
             break
         counts = best

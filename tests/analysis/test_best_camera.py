@@ -137,7 +137,7 @@ def test_the_command_writes_the_best_cameras(here: Path, ommatid: Command) -> No
     predicted = document(ommatid("predict", "best/camera1.toml", "--no-rays", "--json"))[0]
     assert predicted["mse"] == pytest.approx(found["cameras"][0]["with_edges"], rel=1e-9)
     lines = ommatid("design", "tile19", *listed).out
-    assert "no camera is better than" in lines
+    assert "no such camera is better than" in lines
     assert "1/3 + 1/4 + 1/5" in lines
 
 
@@ -163,6 +163,36 @@ def test_what_has_no_bound_is_refused_in_one_sentence(words: str, here: Path, om
     assert (ended.code, words in ended.err) == (2, True), ended.err
     assert len(ended.err.splitlines()) == 1
     assert [path.name for path in here.iterdir()] == ["tiny.toml"]
+
+
+def test_the_light_of_a_small_dark_target_counts() -> None:
+    """Shot noise is that of the picture, of which a square of a hundred pixels has other light."""
+    dark = (
+        "target.origin=[200,150]",
+        "target.shape=[40,40]",
+        'prior.kind="exponential"',
+        "prior.correlation_length=5 mm",
+    )
+    described = read(GALLERY / "sensor.toml", (*dark, "target.detail=1", "camera.wavelength=none"))
+    best = best_camera(described, [])
+    trimmed = predict_scene(described, rays=False).trimmed_mse
+    assert trimmed is not None
+    assert best.mixture.bound <= best.whole[0].error <= 1.03 * trimmed
+
+
+def test_types_that_no_camera_can_have_are_named_and_left_out() -> None:
+    described = scene('design={apertures=["0.4 mm","9 mm"]}', "target.shape=[119,119]")
+    best = best_camera(described, candidates(described, [Fraction(1, 3)]))
+    assert [each.words for each in best.types] == ["1/3", "1/3 0.4 mm", "1/4", "1/5"]
+    assert [words for words, _ in best.refused] == ["1/3 9 mm"]
+
+
+def test_a_camera_of_an_odd_ratio_has_readings_enough_for_itself() -> None:
+    described = scene("camera.lens.I.magnification=3/5", "camera.lens.I.array=[2,2]", "camera.lens_pitch=2 mm")
+    odd = described.model_copy(
+        update={"camera": described.camera.model_copy(update={"lens": described.camera.lens[:1]})}
+    )
+    assert best_camera(odd, candidates(odd, [Fraction(3, 5)])).whole[0].counts == (1,)
 
 
 def test_cameras_of_real_lenses_are_those_of_the_scene_s_target() -> None:

@@ -224,7 +224,7 @@ class DesignTable(Table):
     readings: float | None = Field(
         default=None,
         gt=0,
-        le=1000,
+        le=100,
         description="readings per pixel of f, of all lens types together; absent: those of the camera",
     )
 

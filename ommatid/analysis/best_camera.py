@@ -28,6 +28,7 @@ from ommatid.scenes.scene import Scene, parse, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import DesignTable
 
+from .design import check_detail
 from .mixture import PART, Evaluation, Mixture, WaveGroups, WholeMixture, best_mixture, best_whole
 from .predicted_recording import prior_without_stack, recording_without_rays
 
@@ -116,7 +117,9 @@ def best_camera(scene: Scene, wanted: Sequence[LensCandidate]) -> BestCamera:
     types, refused = list[LensCandidate](), dict[str, str]()
     for candidate in sorted({*own, *wanted}, key=lambda each: (each.ratio, each.aperture or 0.0, each.open or ())):
         try:
-            derive(scene_of(scene, [candidate]))
+            single = scene_of(scene, [candidate])
+            derive(single)
+            check_detail(scene, single)
             types.append(candidate)
         except InputError as error:
             refused[candidate.words] = _reason(scene, error)

@@ -13,6 +13,8 @@ from typing import Any
 from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import derive
+from ommatid.scenes.optics.negligible import ignores_detail
 from ommatid.scenes.scene import Scene, parse
 
 from .prediction_table import DIGITS, json_of
@@ -105,6 +107,15 @@ def with_lens(scene: Scene, magnification: Fraction) -> Scene:
     added = {**optics, "name": name, "magnification": str(magnification), "array": [count, count], "pixels": "fit"}
     camera = {**data["camera"], "lens": [*data["camera"]["lens"], added]}
     return parse({**data, "camera": camera}, scene.source)
+
+
+def check_detail(scene: Scene, wider: Scene) -> None:
+    """Raise InputError for lens types that see detail finer than f, of which a scene of whole pixels says nothing."""
+    if derive(scene).covers_whole_pixels and ignores_detail(wider, derive(wider)):
+        raise InputError(
+            "its readings divide pixels of f, so its error depends on detail finer than f; set target.detail and a"
+            " correlated prior"
+        )
 
 
 def _between(before: Fraction, last: Fraction, end: Fraction, where: str) -> list[Fraction]:

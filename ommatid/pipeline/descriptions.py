@@ -12,7 +12,7 @@ import numpy as np
 
 from ommatid.analysis import best_camera, summary
 from ommatid.analysis.best_camera import LensCandidate
-from ommatid.analysis.design import DesignCandidate, DesignComparison, with_lens
+from ommatid.analysis.design import DesignCandidate, DesignComparison, check_detail, with_lens
 from ommatid.analysis.predict import electrons, optics, predict_scene
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.runtime.errors import InputError, naming_source
@@ -21,7 +21,6 @@ from ommatid.runtime.progress import Progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.camera import derive
 from ommatid.scenes.geometry.optical_terms import ThroughFocus
-from ommatid.scenes.optics.negligible import ignores_detail
 from ommatid.scenes.scene import Scene, write
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.renderer import variant
@@ -53,16 +52,12 @@ def focus_curves(scene: Scene) -> list[ThroughFocus]:
 
 def compare_lens_types(scene: Scene, magnifications: Sequence[Fraction], progress: Progress) -> DesignComparison:
     """Predict the error of the scene with one more lens type of each magnification, with the ideal H."""
-    before, of_pixels = predict_scene(scene, rays=False), derive(scene).covers_whole_pixels
+    before = predict_scene(scene, rays=False)
     candidates: list[DesignCandidate] = []
     for index, magnification in enumerate(magnifications):
         try:
             wider = with_lens(scene, magnification)
-            if of_pixels and ignores_detail(wider, derive(wider)):  # of which the scene says nothing
-                raise InputError(
-                    "not ranked: its sensor pixels divide pixels of f, so its error depends on detail finer than f; set"
-                    " target.detail and a correlated prior"
-                )
+            check_detail(scene, wider)
             candidates.append(DesignCandidate(str(magnification), predict_scene(wider, rays=False)))
         except InputError as error:
             reason = str(error).removeprefix(f"{scene.source}: ")

@@ -97,6 +97,9 @@ def test_exchanges_find_the_best_of_all_whole_cameras(noise: float) -> None:
     assert min(errors) >= mixture.bound
 
 
+CORRELATED = "prior.kind=exponential", "prior.correlation_length=25 mm"
+
+
 def scene(*changes: str) -> Scene:
     return read(GALLERY / "photo.toml", ("target.shape=[119,119]", *changes))
 
@@ -181,10 +184,18 @@ def test_the_light_of_a_small_dark_target_counts() -> None:
 
 
 def test_types_that_no_camera_can_have_are_named_and_left_out() -> None:
-    described = scene('design={apertures=["0.4 mm","9 mm"]}', "target.shape=[119,119]")
+    described = scene('design={apertures=["0.4 mm","9 mm"]}', "target.shape=[59,59]", "target.detail=3", *CORRELATED)
     best = best_camera(described, candidates(described, [Fraction(1, 3)]))
     assert [each.words for each in best.types] == ["1/3", "1/3 0.4 mm", "1/4", "1/5"]
     assert [words for words, _ in best.refused] == ["1/3 9 mm"]
+
+
+def test_types_whose_detail_the_scene_does_not_know_are_left_out() -> None:
+    """Behind pinholes every reading is a sum of whole pixels of f, and behind apertures none is."""
+    described = scene('design={apertures=["0.4 mm"]}')
+    best = best_camera(described, candidates(described, [Fraction(1, 3)]))
+    assert [each.words for each in best.types] == ["1/3", "1/4", "1/5"]
+    assert ["detail finer than f" in reason for _, reason in best.refused] == [True]
 
 
 def test_a_camera_of_an_odd_ratio_has_readings_enough_for_itself() -> None:

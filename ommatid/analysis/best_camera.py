@@ -224,9 +224,9 @@ def _bands_and_weights(
 
 
 def _possible(scene: Scene, types: Sequence[LensCandidate]) -> tuple[WaveGroups, list[LensCandidate], dict[str, str]]:
-    """Return the groups of all types of which there are any, these types, and why the others have none.
+    """Return the groups of waves of the lens types that the camera can have, these types, and why not the others.
 
-    Raises InputError if none has.
+    Raises InputError if it can have none.
     """
     refused: dict[str, str] = {}
     try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -276,8 +275,12 @@ def test_a_run_that_is_killed_between_its_files_leaves_nothing_of_two_results(
     kept: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = {name: (kept / name).read_bytes() for name in ("estimate.png", "overview.png")}
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as patched:
-        patched.setattr(result_files, "write_estimate", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        patched.setattr(result_files, "write_estimate", killed)
         assert ommatid(*RUN, *CHANGED).code == 1
     assert (kept / "estimate.png").read_bytes() != whole["estimate.png"]
     assert not (kept / "estimate.exr").exists()

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
-from math import ceil
 from typing import Any
 
 import numpy as np
@@ -28,54 +27,15 @@ from ommatid.scenes.scene import Scene, parse, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import DesignTable
 
-from .design import check_detail
+from .design import LensCandidate, check_detail
 from .mixture import PART, Evaluation, Mixture, WaveGroups, WholeMixture, best_mixture, best_whole
 from .predicted_recording import prior_without_stack, recording_without_rays
 
-OPTICS = ("aperture", "focus", "distortion", "surfaces", "scale", "fill_factor")  # copied from the last lens type
 SIDE, FINE_SIDE = 119, 59  # pixels of f of the square whose waves are summed; of one in front of a finer world
 LARGEST = 2**16  # pixels of a target whose own waves are summed
 MOST_CANDIDATES = 200
 SHOWN = 3  # cameras of whole arrays
 ROUNDING = 1e-9  # of readings
-
-
-@dataclass(frozen=True)
-class LensCandidate:
-    """A lens type of a magnification, and of an aperture (mm) and open part where these are not the last type's."""
-
-    ratio: Fraction
-    aperture: float | None = None
-    open: tuple[Fraction, Fraction] | None = None
-
-    @property
-    def side(self) -> int:
-        """Sub-imagers along a side of an array, which sees every pixel of f."""
-        return ceil(self.ratio)
-
-    @property
-    def readings(self) -> float:
-        """Readings of an array per pixel of f."""
-        return float((self.side / self.ratio) ** 2)
-
-    @property
-    def words(self) -> str:
-        """The type as tables name it."""
-        words = [str(1 / self.ratio)]
-        words += [] if self.aperture is None else [f"{self.aperture:g} mm"]
-        if self.open is not None:
-            words.append(f"open {' x '.join(str(part) for part in dict.fromkeys(self.open))}")
-        return " ".join(words)
-
-    def table(self, last: dict[str, Any], name: str) -> dict[str, Any]:
-        """Return the type as a table of a scene; last : the scene's last lens type, whose optics it takes."""
-        optics = {key: last[key] for key in OPTICS if key in last}
-        if self.aperture is not None:
-            optics["aperture"] = f"{self.aperture!r} mm"
-        if self.open is not None:
-            optics["fill_factor"] = [str(part) for part in self.open]
-        array = [self.side, self.side]
-        return {**optics, "name": name, "magnification": str(1 / self.ratio), "array": array, "pixels": "fit"}
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,46 @@ from .prediction_table import DIGITS, json_of
 
 ADDED = "added"  # name of the lens type
 MAX_CANDIDATES = 1000
-OPTICS = ("aperture", "focus", "distortion", "surfaces", "scale")  # keys copied from the camera's last lens type
+# Keys that are copied from the camera's last lens type, so that like is compared with like.
+OPTICS = ("aperture", "focus", "distortion", "surfaces", "scale", "coating", "fill_factor")
+
+
+@dataclass(frozen=True)
+class LensCandidate:
+    """A lens type of a magnification, and of an aperture (mm) and open part where these are not the last type's."""
+
+    ratio: Fraction
+    aperture: float | None = None
+    open: tuple[Fraction, Fraction] | None = None
+
+    @property
+    def side(self) -> int:
+        """Sub-imagers along a side of an array, which sees every pixel of f."""
+        return ceil(self.ratio)
+
+    @property
+    def readings(self) -> float:
+        """Readings of an array per pixel of f."""
+        return float((self.side / self.ratio) ** 2)
+
+    @property
+    def words(self) -> str:
+        """The type as tables name it."""
+        words = [str(1 / self.ratio)]
+        words += [] if self.aperture is None else [f"{self.aperture:g} mm"]
+        if self.open is not None:
+            words.append(f"open {' x '.join(str(part) for part in dict.fromkeys(self.open))}")
+        return " ".join(words)
+
+    def table(self, last: dict[str, Any], name: str) -> dict[str, Any]:
+        """Return the type as a table of a scene; last : the scene's last lens type, whose optics it takes."""
+        optics = {key: last[key] for key in OPTICS if key in last}
+        if self.aperture is not None:
+            optics["aperture"] = f"{self.aperture!r} mm"
+        if self.open is not None:
+            optics["fill_factor"] = [str(part) for part in self.open]
+        array = [self.side, self.side]
+        return {**optics, "name": name, "magnification": str(1 / self.ratio), "array": array, "pixels": "fit"}
 
 
 @dataclass(frozen=True)
@@ -94,19 +133,15 @@ def magnifications(text: str, where: str = "--candidates") -> list[Fraction]:
 def with_lens(scene: Scene, magnification: Fraction) -> Scene:
     """Return the scene with one more lens type: 1/magnification sub-imagers along each axis, as large as fits.
 
-    Aperture, focus, distortion and surfaces are those of the last type, so that like is compared with like.
-    Raises InputError where not one pixel fits the target.
+    Its optics are those of the last type. Raises InputError where not one pixel fits the target.
     """
     data = scene.plain()
-    count = ceil(1 / magnification)
     taken = {lens["name"] for lens in data["camera"]["lens"]}
     names = [ADDED, *(f"{ADDED}-{number}" for number in range(2, MAX_CANDIDATES))]
     name = next(name for name in names if name not in taken)
-    last = data["camera"]["lens"][-1]
-    optics = {key: last[key] for key in OPTICS if key in last}
-    added = {**optics, "name": name, "magnification": str(magnification), "array": [count, count], "pixels": "fit"}
-    camera = {**data["camera"], "lens": [*data["camera"]["lens"], added]}
-    return parse({**data, "camera": camera}, scene.source)
+    lenses = data["camera"]["lens"]
+    added = LensCandidate(1 / magnification).table(lenses[-1], name)
+    return parse({**data, "camera": {**data["camera"], "lens": [*lenses, added]}}, scene.source)
 
 
 def check_detail(scene: Scene, wider: Scene) -> None:

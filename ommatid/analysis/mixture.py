@@ -93,11 +93,6 @@ class Mixture:
         """An error that no mixture of these lens types with as many readings falls below."""
         return self.error - self.gap
 
-    @property
-    def parts(self) -> list[int]:
-        """The lens types that it takes."""
-        return [int(index) for index in np.flatnonzero(self.amounts > PART)]
-
 
 def best_mixture(groups: WaveGroups, readings: float) -> Mixture:
     """Return the mixture of least error that takes so many readings per pixel of f."""

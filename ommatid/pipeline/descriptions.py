@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from ommatid.analysis import best_camera, summary
-from ommatid.analysis.best_camera import LensCandidate
-from ommatid.analysis.design import DesignCandidate, DesignComparison, check_detail, with_lens
+from ommatid.analysis.design import DesignCandidate, DesignComparison, LensCandidate, check_detail, with_lens
 from ommatid.analysis.predict import electrons, optics, predict_scene
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.runtime.errors import InputError, naming_source

@@ -15,7 +15,7 @@ from ommatid.analysis.study import remove_study
 from ommatid.batch.frames import FrameOptions
 from ommatid.batch.remote import SILENT
 from ommatid.page.batch_index import INDEX, cached_index
-from ommatid.page.cached import REPORT, cached_page
+from ommatid.page.cached import REPORT
 from ommatid.reconstruct.output import result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture, clear_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
@@ -38,7 +38,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables import toml
 
-from .stages import StageResults, calibrated_model, earlier_report, finish
+from .stages import StageResults, calibrated_model, earlier_report, finish, write_page
 
 STACK, MODEL = "stack.exr", "model.npz"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", ".json", ".html")
@@ -181,16 +181,14 @@ def _design_warnings(folder: Path) -> tuple[str, ...]:
 
 
 def _write_page(folder: Path) -> None:
-    """Write the page of a finished run."""
-    from ommatid.simulate.ideal import matrix_as_designed
-
+    """Write the page of a finished run. Raises InputError if its files are of several runs."""
     report = run_json.read(folder)
     recorded, calibrated = stack_file.read(folder / STACK), model_file.read(folder / MODEL)
     regions = [(region.corner, region.size) for region in report.regions]
     truth = result_files.truth_beside(folder / STACK, recorded)
     if report.fingerprint != result_files.fingerprint_of(recorded, calibrated, truth, regions):
         raise InputError(f"{folder}: run.json is of another stack or model than those beside it; run the scene again")
-    cached_page(folder, report, partial(matrix_as_designed, recorded.camera), recorded, calibrated)
+    write_page(StageResults(report, recorded, calibrated, made=False, files=0.0), folder, SILENT)
 
 
 @dataclass(frozen=True)

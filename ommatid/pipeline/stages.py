@@ -149,12 +149,10 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
     observer.done("reconstruct", made)
     worked = {"render": rendered, "calibrate": calibrated, "reconstruct": made}
     files = perf_counter() - begun - sum(report.stages[name].seconds for name, ran in worked.items() if ran)
-    from ommatid.analysis import depth_error
-
     if scene.world is not None:
-        report = report.with_changes(depth=depth_error.depth_error_of_run(folder, camera))
-    else:
-        (folder / depth_error.PICTURE).unlink(missing_ok=True)
+        from ommatid.analysis.depth_error import depth_error_of_run
+
+        report = report.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
         studied = _studied(setup, stack, folder, observer)
         report = with_stage(report.with_changes(study=studied.cases), "study", studied.seconds)

@@ -490,7 +490,11 @@ INTERVAL = {"mse": 4.0, "low": 2.25, "high": 6.25}
     [
         ({"mse": 4.0, "expected_given_truth": INTERVAL}, "agrees", "The error is as expected for this image."),
         ({"mse": 9.0, "expected_given_truth": INTERVAL}, "worse", "The error is larger than expected for this image."),
-        ({"mse": 1.0, "expected_given_truth": INTERVAL}, "better", "The error is smaller than expected for this image"),
+        (
+            {"mse": 1.0, "expected_given_truth": INTERVAL},
+            "better",
+            "The error is smaller than expected for this image.",
+        ),
         ({"mse": 9.0}, "unknown", ""),
         ({}, "unknown", "The truth is not known."),
     ],
@@ -499,7 +503,7 @@ def test_the_sentence_compares_measured_and_expected_error(
     error: dict[str, Any], agreement: str, sentence: str
 ) -> None:
     assert facts.agreement(described(**error).error) == agreement
-    assert words.sentence(described(**error)).startswith(sentence)
+    assert words.sentence(described(**error)) == sentence
 
 
 def test_without_trust_the_sentence_says_that_the_numbers_are_of_little_use() -> None:

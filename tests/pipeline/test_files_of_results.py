@@ -271,6 +271,15 @@ def test_a_picture_that_was_cut_short_is_made_again(name: str, kept: Path, ommat
 # --- results of two runs
 
 
+def test_a_first_result_removes_no_file_of_another_program(here: Path, ommatid: Command) -> None:
+    (here / "out" / "tiny").mkdir(parents=True)
+    for name in ("estimate.npy", "estimate.tiff", "depth.png"):
+        (here / "out" / "tiny" / name).write_text("of another program", encoding="utf-8")
+    assert ommatid(*RUN).code == 0
+    for name in ("estimate.npy", "estimate.tiff", "depth.png"):
+        assert (here / "out" / "tiny" / name).read_text(encoding="utf-8") == "of another program"
+
+
 def test_a_run_that_is_killed_between_its_files_leaves_nothing_of_two_results(
     kept: Path, ommatid: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -137,10 +137,10 @@ def write_results(folder: Path, stack: Stack, restoration: Reconstruction, repor
 
     Those of an earlier result are removed first, so that nothing of two results is ever in a folder.
     """
-    for name in (RUN, ESTIMATE):
-        (folder / name).unlink(missing_ok=True)
-    for name in ("npy", "tiff16"):
-        format_file(folder / ESTIMATE, name).unlink(missing_ok=True)
+    if any((folder / name).exists() for name in (ESTIMATE, RUN)):
+        formats = (format_file(folder / ESTIMATE, name) for name in ("npy", "tiff16"))
+        for path in (*formats, folder / RUN, folder / ESTIMATE):  # the estimate last: it tells that there was one
+            path.unlink(missing_ok=True)
     write_picture(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
     write_overview(folder, stack, maps_of(restoration), report)
     write_estimate(folder / ESTIMATE, restoration, record_of(report))

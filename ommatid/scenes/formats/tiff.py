@@ -151,14 +151,16 @@ def _segment(page: Any) -> int:
 
 def _check_segments(stream: BinaryIO, page: Any) -> None:
     """Raise ValueError if a strip or tile is missing, outside the file, or not as long as its pixels."""
-    import imagecodecs
-
     size = stream.seek(0, io.SEEK_END)
     offsets, counts = list(page.dataoffsets), list(page.databytecounts)
     expected = list(_lengths(page))
     if not len(offsets) == len(counts) == len(expected):
         raise ValueError("some of its strips are missing")
-    decode: Any = None if page.compression == UNCOMPRESSED else getattr(imagecodecs, DECODERS[page.compression])
+    decode: Any = None
+    if page.compression != UNCOMPRESSED:
+        import imagecodecs
+
+        decode = getattr(imagecodecs, DECODERS[page.compression])
     for offset, count, needed in zip(offsets, counts, expected, strict=True):
         if offset + count > size:
             raise ValueError("it is cut short")

@@ -99,7 +99,7 @@ class Directions:
     @property
     def matrix(self) -> sparse.csc_array:
         """L."""
-        return sparse.csc_array(sparse.block_diag([block for _, block in self.blocks()]))
+        return sparse.csc_array(sparse.block_diag([sparse.csc_array(block) for _, block in self.blocks()]))
 
     def adjoint(self, readings: FloatArray) -> FloatArray:
         """Return L^T g: (M,) to (q,)."""

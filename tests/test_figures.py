@@ -111,6 +111,12 @@ def test_the_best_camera(ommatid: Command) -> None:
     best = found["cameras"][0]
     assert best["arrays"] == [1, 1, 1, 0, 0, 0, 0]
     check_figures("camera.md", "the best camera is the paper's, {} % above the bound.", 100 * best["above"])
+    thin = json.loads(
+        ommatid("design", "tile19", "--set", magnifications, "--set", "design.thickness=1 mm", "--json").out
+    )
+    kinds = [words for words, count in zip(thin["types"], thin["cameras"][0]["arrays"], strict=True) if count]
+    assert kinds == ["1/6", "1/7", "1/8"]
+    check_figures("camera.md", "and its error is {} times larger.", thin["cameras"][0]["mse"] / best["mse"])
 
 
 def test_the_photograph_of_the_readme() -> None:

@@ -1,16 +1,17 @@
 """The camera of least expected error that can be made of given lens types, and a bound on that of every other.
 
-Errors are those of Eq. 5 far from the edges, by transfer functions, with a perfect H and a perfect rendering.
+Errors are those of Eq. 5 far from the edges, by transfer functions, with a perfect H and a perfect rendering. They are
+those of lenses in their places and without distortion, whatever the scene has: the bound is that of shift-invariant
+cameras.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from ommatid.reconstruct.frame.bands import Bands
 from ommatid.reconstruct.frame.conjugate_gradients import frame_system
 from ommatid.reconstruct.method_choice import MethodChoice
 from ommatid.reconstruct.methods.method import Execution
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import one_thread
 from ommatid.scenes.camera import Camera, derive
@@ -28,34 +30,151 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import DesignTable
 
 from .design import LensCandidate, check_detail
-from .mixture import PART, Evaluation, Mixture, WaveGroups, WholeMixture, best_mixture, best_whole
+from .mixture import TIGHT, Evaluation, Mixture, WaveGroups, WholeMixture, best_mixture, best_whole
 from .predicted_recording import prior_without_stack, recording_without_rays
 
 SIDE, FINE_SIDE = 119, 59  # pixels of f of the square whose waves are summed; of one in front of a finer world
 LARGEST = 2**16  # pixels of a target whose own waves are summed
 MOST_CANDIDATES = 200
+MOST_READINGS = 100.0  # per pixel of f, of a camera that reaches an error
+NEARLY = 1e-3  # gap relative to the value, of mixtures that are drawn or lead to whole arrays
 SHOWN = 3  # cameras of whole arrays
-ROUNDING = 1e-9  # of readings
+ROUNDING = 1e-9  # of costs and depths
+WIDER = (1.0, 1.05, 1.1, 1.2, 1.35, 1.5)  # distances of lenses on a sensor that is to be filled, times the least
+MORE = (1.02, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0)  # times the least cost of a mixture, that whole arrays may take
+CLOSE = 0.01  # of the least cost that reaches an error
 
 
 @dataclass(frozen=True)
 class BestCamera:
-    """The best mixture of lens types, the best cameras of whole arrays, and the scene's own camera.
+    """The best mixture of lens types that costs `budget`, and the best cameras of whole arrays, which cost no more."""
 
-    readings : per pixel of f;  own : arrays of the scene's camera and their error, None where it has other arrays
-    refused : lens types that the camera cannot have, with the reason
-    """
-
-    types: tuple[LensCandidate, ...]
-    readings: float
+    space: DesignSpace
+    budget: float
     mixture: Mixture
     whole: tuple[WholeMixture, ...]
-    own: tuple[tuple[float, ...], Evaluation] | None
-    refused: tuple[tuple[str, str], ...]
 
-    def above(self, error: float) -> float:
-        """Return by how much an error exceeds the bound, relative to it."""
-        return error / self.mixture.bound - 1
+    def above(self, found: Evaluation) -> float:
+        """Return by how much a value exceeds the bound, relative to it."""
+        return (found.value - self.mixture.bound) / abs(self.mixture.bound)
+
+
+@dataclass(frozen=True)
+class DesignSpace:
+    """The lens types that a scene's camera may have, what each tells of the target, and what it costs.
+
+    groups : costs are in readings per pixel of f or, with design.sensor_area, in mm2 of the sensor
+    depths : (types,) distances of their sensors from their lenses, mm
+    cells : (types,) sides of the square that a lens takes on the sensor, mm;  budget : the scene's
+    own : the scene's camera, None where it has other arrays;  refused : lens types that it cannot have, with the reason
+    """
+
+    scene: Scene
+    types: tuple[LensCandidate, ...]
+    groups: WaveGroups
+    depths: FloatArray
+    cells: FloatArray
+    budget: float
+    own: WholeMixture | None
+    refused: dict[str, str]
+
+    @property
+    def unit(self) -> str:
+        """The unit of costs."""
+        return "readings per pixel of f" if _area(self.scene) is None else "mm2 of the sensor"
+
+    def information(self, camera: WholeMixture) -> float:
+        """Return the information that a camera's readings hold, in bits per pixel of f."""
+        return self.groups.information(np.array(camera.counts, dtype=np.float64))
+
+    def cost(self, camera: WholeMixture) -> float:
+        """Return what a camera costs."""
+        return float(self.groups.costs @ np.array(camera.counts))
+
+    def best(self, budget: float, most: int = SHOWN, tight: float = TIGHT) -> BestCamera:
+        """Return the best mixture and the best `most` cameras for a budget. Raises InputError if it buys no array.
+
+        tight : as of `best_mixture`
+        """
+        least = float(self.groups.costs.min())
+        if budget < least * (1 - ROUNDING):
+            key = "readings" if _area(self.scene) is None else "sensor_area"
+            raise InputError(
+                f"{self.scene.source}: design.{key}: the smallest array takes {least:.3g} {self.unit}, got"
+                f" {budget:.3g}; raise it"
+            )
+        with one_thread():
+            mixture = best_mixture(self.groups, budget, tight)
+            whole = best_whole(self.groups, budget * (1 + ROUNDING), mixture, most, self.fits)
+        return BestCamera(self, budget, mixture, tuple(whole))
+
+    def cheapest(self, error: float) -> tuple[float, BestCamera]:
+        """Return a cost below which no mixture has so small an error, and the camera of least cost that has it.
+
+        Raises InputError, which names the least error within reach, if none has.
+        """
+        low = float(self.groups.costs.min())
+        most = MOST_READINGS * float((self.groups.costs / [each.readings for each in self.types]).max())
+
+        def mixed(budget: float) -> bool:
+            return best_mixture(self.groups, budget, NEARLY).bound <= error
+
+        def made(budget: float) -> bool:
+            whole = self.best(budget, 1, NEARLY).whole
+            return bool(whole) and whole[0].found.error <= error
+
+        with one_thread():
+            least = _least(low, most, mixed) / (1 + CLOSE) if mixed(most) else most
+            reached = next((budget for share in MORE if made(budget := least * share)), None)
+        if reached is None:
+            within = self.best(most, 1, NEARLY)
+            nearest = min((each.found.error for each in within.whole), default=within.mixture.found.error)
+            raise InputError(
+                f"{self.scene.source}: design.error: no camera of these lens types that costs up to {most:.3g}"
+                f" {self.unit} has an error of {error:g}; the least is {nearest:.4g}"
+            )
+        return least, self.best(_least(max(low, least), reached, made))
+
+    def fits(self, counts: tuple[int, ...]) -> bool:
+        """Return True if whole arrays fit the sensor, where the scene gives one."""
+        if self.scene.camera.sensor is None and _area(self.scene) is None:
+            return True
+        try:
+            derive(self.camera(counts))
+        except InputError:
+            return False
+        return True
+
+    def camera(self, counts: Sequence[int]) -> Scene:
+        """Return the scene of a camera of whole arrays. Raises InputError where it is impossible."""
+        numbers = [index for index, count in enumerate(counts) for _ in range(count)]
+        types, outline = [self.types[index] for index in numbers], self.scene.design and self.scene.design.sensor_area
+        if not outline:
+            return scene_of(self.scene, types)
+        cell = float(self.cells[numbers].max())
+        for wider in WIDER:
+            made = scene_of(self.scene, types, wider * cell, outline)
+            try:
+                derive(made)
+                return made
+            except InputError:  # patches of neighbouring types may overlap
+                continue
+        return scene_of(self.scene, types, cell, outline)
+
+    def thinner(self, depth: float) -> DesignSpace:
+        """Return the lens types whose sensors are at most so far from their lenses, mm."""
+        kept = self.depths <= depth * (1 + ROUNDING)
+        types = tuple(each for each, held in zip(self.types, kept, strict=True) if held)
+        depths, cells = self.depths[kept], self.cells[kept]
+        return replace(self, types=types, groups=self.groups.only(kept), depths=depths, cells=cells, own=None)
+
+
+def _least(low: float, high: float, reached: Callable[[float], bool]) -> float:
+    """Return the least budget that reaches something, as `high` does, to a hundredth."""
+    while high > low * (1 + CLOSE):
+        middle = (low * high) ** 0.5
+        low, high = (low, middle) if reached(middle) else (middle, high)
+    return high
 
 
 def candidates(scene: Scene, magnifications: Sequence[Fraction]) -> list[LensCandidate]:
@@ -69,56 +188,93 @@ def candidates(scene: Scene, magnifications: Sequence[Fraction]) -> list[LensCan
     return found
 
 
-def best_camera(scene: Scene, wanted: Sequence[LensCandidate]) -> BestCamera:
-    """Choose among lens types and the scene's own. Raises InputError without a bound, and as a prediction does."""
-    camera = derive(scene)
+def design_space(scene: Scene, wanted: Sequence[LensCandidate]) -> DesignSpace:
+    """Return what lens types and the scene's own bring. Raises InputError without a bound, and as a prediction does."""
+    table = scene.design or DesignTable()
+    camera, described = derive(scene), scene
     _check(scene, camera)
+    scene = _in_place(scene)
     own = _own_arrays(camera)
-    types, refused = list[LensCandidate](), dict[str, str]()
+    types, refused = dict[LensCandidate, tuple[float, float]](), dict[str, str]()
     for candidate in sorted({*own, *wanted}, key=lambda each: (each.ratio, each.aperture or 0.0, each.open or ())):
         try:
-            single = scene_of(scene, [candidate])
-            derive(single)
-            check_detail(scene, single)
-            types.append(candidate)
+            types[candidate] = _measures(scene, candidate)
         except InputError as error:
             refused[candidate.words] = _reason(scene, error)
     if not types:
         raise InputError(f"{scene.source}: no lens type is possible: {': '.join(next(iter(refused.items())))}")
-    own_readings = sum(lens.count / float(lens.ratio) ** 2 for lens in camera.types)
-    readings = own_readings if scene.design is None or scene.design.readings is None else scene.design.readings
-    least = min(each.readings for each in types)
-    if readings < least * (1 - ROUNDING):
-        raise InputError(
-            f"{scene.source}: design.readings: the smallest array takes {least:.3g} readings per pixel of f, got"
-            f" {readings:g}; raise it"
-        )
     with one_thread():
-        groups, types, others = _possible(scene, types)
-        mixture = best_mixture(groups, readings)
-        whole = best_whole(groups, readings * (1 + ROUNDING), mixture, SHOWN)
-        counts = tuple(float(own[each]) for each in types)
-        evaluated = (counts, groups.evaluate(np.array(counts))) if own and own.keys() <= set(types) else None
-    return BestCamera(tuple(types), readings, mixture, tuple(whole), evaluated, tuple({**refused, **others}.items()))
+        bands, kept, others = _possible(scene, list(types))
+        depths, cells = np.array([types[each] for each in kept]).T
+        area = _area(scene)
+        sides = np.array([each.side for each in kept])
+        costs = [each.readings for each in kept] if area is None else np.square(sides * cells).tolist()
+        groups = WaveGroups.of(bands, costs, table.goal)
+        counts = [own[each] for each in kept]
+        known = own and own.keys() <= set(kept)
+        found = WholeMixture(tuple(counts), groups.evaluate(np.array(counts, dtype=np.float64))) if known else None
+    budget = area or table.readings or sum(lens.count / float(lens.ratio) ** 2 for lens in camera.types)
+    return DesignSpace(described, tuple(kept), groups, depths, cells, budget, found, {**refused, **others})
 
 
-def scene_of(scene: Scene, types: Sequence[LensCandidate]) -> Scene:
-    """Return the scene with an array of each of these lens types. Raises InputError where the camera is impossible."""
+def _area(scene: Scene) -> float | None:
+    """Return the area of the sensor that limits a camera, mm2, None where readings do."""
+    size = None if scene.design is None else scene.design.sensor_area
+    return None if size is None else size[0] * size[1]
+
+
+def _in_place(scene: Scene) -> Scene:
+    """Return the scene with lenses in their places and without distortion."""
     tables = scene.plain()
-    last = tables["camera"]["lens"][-1]
+    camera = {key: each for key, each in tables["camera"].items() if key not in ("tolerance", "sensor")}
+    camera["lens"] = [{key: each for key, each in lens.items() if key != "distortion"} for lens in camera["lens"]]
+    return with_tables(parse({**tables, "camera": camera}, scene.source), design=scene.design)
+
+
+def _measures(scene: Scene, candidate: LensCandidate) -> tuple[float, float]:
+    """Return the depth of a lens type's sensor, and the side of a lens on it, mm.
+
+    Raises InputError for a lens type that the camera cannot have.
+    """
+    thickness, widest = scene.design.thickness if scene.design else None, scene.camera.lens_pitch
+    widest += max(derive(scene).shape) * scene.camera.pixel_pitch + (candidate.aperture or 0.0)
+    single = scene_of(scene, [candidate], None if _area(scene) is None else widest)
+    camera = derive(single)
+    check_detail(scene, single)
+    (lens,) = camera.types
+    # Patches of neighbouring lenses lie apart by less than the lenses where their windows move on.
+    depth, larger, moved = camera.depth(lens), camera.optical_magnification(lens), float(max(lens.step))
+    cell = (max(lens.pixels) * camera.pixel_pitch + larger * moved * camera.target_pitch) / (1 + larger)
+    if thickness is not None and depth > thickness * (1 + ROUNDING):
+        raise InputError(f"its sensor stands {depth:.3g} mm behind its lenses, design.thickness is {thickness:g} mm")
+    return depth, scene.camera.lens_pitch if lens.optics.surfaces else max(cell, lens.optics.aperture or 0.0)
+
+
+def scene_of(
+    scene: Scene,
+    types: Sequence[LensCandidate],
+    pitch: float | None = None,
+    outline: tuple[float, float] | None = None,
+) -> Scene:
+    """Return the scene with an array of each of these lens types. Raises InputError where the camera is impossible.
+
+    pitch : distance of neighbouring lenses, mm;  outline : height and width of the sensor, mm; None: those of the scene
+    """
+    tables = scene.plain()
+    camera, last = tables["camera"], tables["camera"]["lens"][-1]
     lenses = [each.table(last, f"L{number}") for number, each in enumerate(types, 1)]
-    return parse({**tables, "camera": {**tables["camera"], "lens": lenses}}, scene.source)
+    changed = {} if pitch is None else {"lens_pitch": f"{pitch!r} mm"}
+    changed |= {} if outline is None else {"sensor": {"size": [f"{side!r} mm" for side in outline]}}
+    return parse({**tables, "camera": {**camera, **changed, "lens": lenses}}, scene.source)
 
 
 def _check(scene: Scene, camera: Camera) -> None:
     """Raise InputError for a scene whose error no transfer functions give, or whose readings have no noise."""
-    where = str(scene.source)
+    where, table = str(scene.source), scene.design or DesignTable()
     if scene.world is not None:
         raise InputError(f"{where}: the bound is that of flat targets, got a [world]")
-    if camera.tolerance is not None:
-        raise InputError(f"{where}: the bound is that of lenses in their places, got camera.tolerance; remove it")
-    if not camera.walls or any(lens.optics.distortion is not None for lens in camera.types):
-        raise InputError(f"{where}: the bound is that of lenses that see the same everywhere")
+    if not camera.walls:
+        raise InputError(f"{where}: the bound is that of lenses that see their own patch, got camera.walls = false")
     if camera.has_surfaces and camera.with_grid_of_matrix.unknowns <= MOST_DENSE:
         raise InputError(
             f"{where}: the bound takes lenses with surfaces in front of more than {MOST_DENSE} pixels, got"
@@ -126,6 +282,10 @@ def _check(scene: Scene, camera: Camera) -> None:
         )
     if not scene.has_noise:
         raise InputError(f"{where}: without noise every mixture is exact or has a null space; set noise.variance")
+    if table.error is not None and table.goal != "error":
+        raise InputError(f"{where}: design.error is reached at least cost, design.goal is '{table.goal}'; remove one")
+    if table.sensor_area is not None and table.readings is not None:
+        raise InputError(f"{where}: design.readings and design.sensor_area both limit the camera; remove one")
 
 
 def _own_arrays(camera: Camera) -> Counter[LensCandidate]:
@@ -183,14 +343,14 @@ def _bands_and_weights(
     return bands, [float(weights[rows].mean()) for rows in setup.camera.type_slices()]
 
 
-def _possible(scene: Scene, types: Sequence[LensCandidate]) -> tuple[WaveGroups, list[LensCandidate], dict[str, str]]:
-    """Return the groups of waves of the lens types that the camera can have, these types, and why not the others.
+def _possible(scene: Scene, types: Sequence[LensCandidate]) -> tuple[Bands, list[LensCandidate], dict[str, str]]:
+    """Return the transfer functions of the lens types that the camera can have, these types, and why not the others.
 
     Raises InputError if it can have none.
     """
     refused: dict[str, str] = {}
     try:
-        return WaveGroups.of(_bands(scene, types), [each.readings for each in types]), list(types), refused
+        return _bands(scene, types), list(types), refused
     except InputError as error:
         if len(types) == 1:
             raise InputError(f"{scene.source}: {types[0].words}: {_reason(scene, error)}") from error
@@ -203,70 +363,8 @@ def _possible(scene: Scene, types: Sequence[LensCandidate]) -> tuple[WaveGroups,
             refused[each.words] = _reason(scene, error)
     if not kept:
         raise InputError(f"{scene.source}: no lens type is possible: {': '.join(next(iter(refused.items())))}")
-    return WaveGroups.of(_bands(scene, kept), [each.readings for each in kept]), kept, refused
+    return _bands(scene, kept), kept, refused
 
 
 def _reason(scene: Scene, error: InputError) -> str:
     return str(error).removeprefix(f"{scene.source}: ")
-
-
-def words_of(amounts: Sequence[float], types: Sequence[LensCandidate]) -> str:
-    """Return amounts of lens types in words: "1/3 + 2 x 1/4", or "1.16 x 1/3 + 1.05 x 1/4"."""
-    named = [(amount, each.words) for amount, each in zip(amounts, types, strict=True) if amount > PART]
-    return " + ".join(words if abs(amount - 1) < PART / 2 else f"{amount:.3g} x {words}" for amount, words in named)
-
-
-def _above(best: BestCamera, error: float) -> str:
-    """Return an error, and how it exceeds the bound."""
-    above = best.above(error)
-    return f"{error:.4g}, {above:.1%} above" if above < 1 else f"{error:.4g}, {above + 1:.3g} times that"
-
-
-def rows(best: BestCamera, with_edges: Sequence[float | str]) -> list[tuple[str, str]]:
-    """Return the proof as rows of a table; with_edges : errors of the cameras of whole arrays, or why there is none."""
-    mixture, types = best.mixture, best.types
-    lines = [
-        (
-            "no such camera is better than",
-            f"MSE {mixture.bound:.4g}: {len(types)} lens types, {best.readings:.3g} readings per pixel of f, windows on"
-            " whole pixels, far from the edges",
-        ),
-        ("best mixture", f"{words_of(mixture.amounts.tolist(), types)}: {mixture.error:.4g}"),
-    ]
-    for number, (each, edges) in enumerate(zip(best.whole, with_edges, strict=True), 1):
-        known = f"{edges:.4g} with edges" if isinstance(edges, float) else edges
-        lines.append(
-            (
-                f"{number}. whole arrays",
-                f"{words_of(each.counts, types)}: {_above(best, each.error)}; {each.information:.3g} bits per pixel;"
-                f" {known}",
-            )
-        )
-    if best.own is not None:
-        counts, found = best.own
-        words = f"{_above(best, found.error)}; {found.information:.3g} bits per pixel"
-        lines.append(("this camera", f"{words_of(counts, types)}: {words}"))
-    return lines + [(f"not {words}", reason) for words, reason in best.refused]
-
-
-def describe(best: BestCamera, with_edges: Sequence[float | str]) -> dict[str, Any]:
-    """Return the proof in JSON's types; with_edges : as of `rows`."""
-    own = best.own and {"arrays": list(best.own[0]), "mse": best.own[1].error, "information": best.own[1].information}
-    return {
-        "types": [each.words for each in best.types],
-        "readings": best.readings,
-        "bound": best.mixture.bound,
-        "mixture": {"arrays": best.mixture.amounts.tolist(), "mse": best.mixture.error, "gap": best.mixture.gap},
-        "cameras": [
-            {
-                "arrays": list(each.counts),
-                "mse": each.error,
-                "above": best.above(each.error),
-                "information": each.information,
-                "with_edges": edges if isinstance(edges, float) else None,
-            }
-            for each, edges in zip(best.whole, with_edges, strict=True)
-        ],
-        "own": own,
-        "refused": dict(best.refused),
-    }

@@ -1,15 +1,18 @@
-"""The mixture of lens types of least error, and a bound on the error of every other.
+"""The mixture of lens types of least error or most information, and a bound on every other mixture.
 
 With x_t arrays of the lens types t, whose windows stand one pixel of f apart, the expected error of a pixel far from
 the edges (Eq. 5) is the mean over groups of waves (`bands`) of
 
     e(x) = a^T (P^-1 + sum_t x_t w_t b_t b_t^T)^-1 a,
 
-a convex function of x >= 0. Let an array of type t take c_t readings per pixel of f, and a camera B of them. The steps
+a convex function of x >= 0, as is minus the information of the readings, -1/2 log2 det(I + P sum_t x_t w_t b_t b_t^T).
+Let an array of type t cost c_t, and a camera B (readings per pixel of f, or area of the sensor). The steps
 
     x_t <- x_t (g_t / c_t)^1/2 B / sum_k c_k x_k (g_k / c_k)^1/2,   g_t = -de / dx_t,
 
-never increase e (they minimise a majorant of it), and no mixture is better than e by more than
+never increase either (Yu 2010, "Monotonic convergence of a general algorithm for computing optimal designs"); between
+them the cost of the type of least g_t / c_t in the mixture goes to that of the largest of all, as far as this helps
+(vertex exchange; Boehning 1986). No mixture is better than e by more than
 
     B max_t g_t / c_t - sum_t x_t g_t
 
@@ -18,27 +21,33 @@ never increase e (they minimise a majorant of it), and no mixture is better than
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from ommatid.reconstruct.frame.bands import Bands
-from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 
-TIGHT = 1e-5  # gap relative to the error, at which the steps end
-MOST_STEPS = 2000
+Goal = Literal["error", "information", "resolution"]
+TIGHT = 1e-5  # gap relative to the value, at which the steps end
+MOST_EXCHANGES = 400  # of costs between two lens types
+STEPS = 6  # between two exchanges
+PARTS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)  # of a type's cost that an exchange tries to give away
+FIRST = 3  # lens types of the first mixture
 PART = 0.01  # of an array, from which a lens type belongs to a mixture
-MOST_ROUNDS = 50  # of exchanges
+MOST_ROUNDS = 50  # of exchanges of whole arrays
+TRIED = 8  # lens types that are evaluated for the place of one array
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The error of a mixture, g_t of every lens type, and the information that the readings hold, in bits per pixel."""
+    """What a mixture brings. value : what is minimised;  gains : g_t of every type;  error : squared, of a pixel"""
 
-    error: float
+    value: float
     gains: FloatArray
-    information: float
+    error: float
 
 
 @dataclass(frozen=True)
@@ -46,33 +55,89 @@ class WaveGroups:
     """What each lens type tells of every group of waves.
 
     rows : (rows, groups, waves) (w_t P)^1/2 b_t;  pixels : (groups, waves) P^1/2 a;  owners : (rows,) lens types
-    costs : (types,) readings per pixel of f of an array
+    costs : (types,) of an array;  shape : rows and columns of groups, whose waves of f have 0 to 1/2 periods per pixel
+    goal : "resolution" is the part of the error in fine waves
     """
 
     rows: FloatArray
     pixels: FloatArray
     owners: IntArray
     costs: FloatArray
+    shape: tuple[int, int]
+    goal: Goal = "error"
 
     @classmethod
-    def of(cls, bands: Bands, costs: Sequence[float]) -> WaveGroups:
+    def of(cls, bands: Bands, costs: Sequence[float], goal: Goal = "error") -> WaveGroups:
         """Take the groups of a camera that has one array of each lens type."""
-        return cls(*bands.groups(), np.array(costs, dtype=np.float64))
+        return cls(*bands.groups(), np.array(costs, dtype=np.float64), bands.shape, goal)
+
+    def only(self, kept: BoolArray) -> WaveGroups:
+        """Return the groups with some of the lens types; kept : (types,)."""
+        numbers, rows = np.cumsum(kept) - 1, kept[self.owners]
+        return replace(self, rows=self.rows[rows], owners=numbers[self.owners[rows]], costs=self.costs[kept])
 
     def evaluate(self, amounts: FloatArray) -> Evaluation:
-        """Return the error with these amounts of the lens types, in arrays."""
-        waves = self.pixels.shape[1]
-        precision = np.tile(np.eye(waves), (len(self.pixels), 1, 1))
-        for row, owner in zip(self.rows, self.owners, strict=True):
-            if amounts[owner] > 0:
-                precision += amounts[owner] * row[:, :, None] * row[:, None, :]
+        """Return what these amounts of the lens types bring, in arrays."""
+        precision = self._precision(amounts)
         seen = np.linalg.solve(precision, self.pixels[..., None])[..., 0]
-        squares = np.square(np.einsum("rgm,gm->rg", self.rows, seen)).mean(axis=1)
-        gains = np.zeros(self.costs.size)
-        np.add.at(gains, self.owners, squares)
-        _, logarithms = np.linalg.slogdet(precision)
-        error = float(np.einsum("gm,gm->g", self.pixels, seen).mean())
-        return Evaluation(error, gains, float(logarithms.mean() / np.log(4)))
+        error = float(np.einsum("gm,gm->g", self.pixels * self._counted[:, None], seen).mean())
+        if self.goal == "information":
+            value = -_bits(precision)
+            squares = np.einsum("rgm,gmr->rg", self.rows, np.linalg.solve(precision, self._columns)) / np.log(4)
+        else:
+            value = error
+            squares = np.square(np.einsum("rgm,gm->rg", self.rows, seen)) * self._counted
+        return Evaluation(value, self._by_type(squares.mean(axis=1)), error)
+
+    def information(self, amounts: FloatArray) -> float:
+        """Return the information that the readings hold, in bits per pixel of f."""
+        return _bits(self._precision(amounts))
+
+    def falls(self, amounts: FloatArray) -> FloatArray:
+        """Return by how much one array more of each lens type lowers the value, (types,), by updates of rank one.
+
+        Exact for lens types of one row; an upper bound for others, whose rows are taken one by one.
+        """
+        precision = self._precision(amounts)
+        spread = np.linalg.solve(precision, self._columns)
+        within = 1 + np.einsum("rgm,gmr->rg", self.rows, spread)
+        if self.goal == "information":
+            falls = np.log(within) / np.log(4)
+        else:
+            falls = np.square(np.einsum("gm,gmr->rg", self.pixels, spread)) / within * self._counted
+        return self._by_type(falls.mean(axis=1))
+
+    def errors(self, amounts: FloatArray) -> FloatArray:
+        """Return the error of each wave of f, whose mean is that of a pixel: (rows, columns)."""
+        seen = np.linalg.solve(self._precision(amounts), self.pixels[..., None])[..., 0]
+        return np.einsum("gm,gm->g", self.pixels, seen).reshape(self.shape)
+
+    def _by_type(self, values: FloatArray) -> FloatArray:
+        """Return sums over the rows of each lens type: (types,)."""
+        return np.bincount(self.owners, values, self.costs.size).astype(np.float64)
+
+    @property
+    def _counted(self) -> FloatArray:
+        """1 for groups whose error counts, 0 for others: (groups,)."""
+        if self.goal != "resolution":
+            return np.ones(len(self.pixels))
+        down, across = (2 * np.arange(size) >= size for size in self.shape)
+        return (down[:, None] | across).ravel().astype(np.float64)
+
+    @property
+    def _columns(self) -> FloatArray:
+        return self.rows.transpose(1, 2, 0)
+
+    def _precision(self, amounts: FloatArray) -> FloatArray:
+        """Return I + sum_t x_t w_t P^1/2 b_t b_t^T P^1/2 of every group: (groups, waves, waves)."""
+        each = amounts[self.owners]
+        taken = self.rows[each > 0] * np.sqrt(each[each > 0])[:, None, None]
+        return np.eye(self.pixels.shape[1]) + np.matmul(taken.transpose(1, 2, 0), taken.transpose(1, 0, 2))
+
+
+def _bits(precision: FloatArray) -> float:
+    _, logarithms = np.linalg.slogdet(precision)
+    return float(logarithms.mean() / np.log(4))
 
 
 @dataclass(frozen=True)
@@ -84,80 +149,105 @@ class Mixture:
     gap: float
 
     @property
-    def error(self) -> float:
-        """The expected error."""
-        return self.found.error
-
-    @property
     def bound(self) -> float:
-        """An error that no mixture of these lens types with as many readings falls below."""
-        return self.error - self.gap
+        """A value that no mixture of these lens types of the same cost falls below."""
+        return self.found.value - self.gap
 
 
-def best_mixture(groups: WaveGroups, readings: float) -> Mixture:
-    """Return the mixture of least error that takes so many readings per pixel of f."""
+def best_mixture(groups: WaveGroups, budget: float, tight: float = TIGHT) -> Mixture:
+    """Return the mixture of least value that costs so much; tight : gap relative to the value, at which steps end."""
     costs = groups.costs
-    mixture = _mixture(groups, readings, readings / costs / costs.size)
-    for _ in range(MOST_STEPS):
-        if mixture.gap <= TIGHT * mixture.error:
+    even = groups.evaluate(budget / costs / costs.size)
+    first = np.argsort(-even.gains / costs)[:FIRST]
+    amounts = np.zeros(costs.size)
+    amounts[first] = budget / costs[first] / first.size
+    mixture = _mixture(groups, budget, amounts)
+    for _ in range(MOST_EXCHANGES):
+        if mixture.gap <= tight * abs(mixture.found.value):
             break
-        steps = mixture.amounts * np.sqrt(mixture.found.gains / costs)
-        mixture = _mixture(groups, readings, steps * readings / float(costs @ steps))
+        mixture = _exchange(groups, budget, mixture)
+        for _ in range(STEPS):
+            steps = mixture.amounts * np.sqrt(mixture.found.gains / costs)
+            mixture = _mixture(groups, budget, steps * budget / float(costs @ steps))
     return mixture
 
 
-def _mixture(groups: WaveGroups, readings: float, amounts: FloatArray) -> Mixture:
+def _exchange(groups: WaveGroups, budget: float, mixture: Mixture) -> Mixture:
+    """Return the mixture after the exchange of cost between two lens types, as much of it as helps."""
+    slopes = mixture.found.gains / groups.costs
+    held = np.flatnonzero(mixture.amounts)
+    worst, best = int(held[slopes[held].argmin()]), int(slopes.argmax())
+    if worst == best:
+        return mixture
+    for part in PARTS:
+        amounts, moved = mixture.amounts.copy(), part * mixture.amounts[worst]
+        amounts[worst] -= moved
+        amounts[best] += moved * groups.costs[worst] / groups.costs[best]
+        tried = _mixture(groups, budget, amounts)
+        if tried.found.value < mixture.found.value:
+            return tried
+    return mixture
+
+
+def _mixture(groups: WaveGroups, budget: float, amounts: FloatArray) -> Mixture:
     found = groups.evaluate(amounts)
-    gap = float(readings * (found.gains / groups.costs).max() - amounts @ found.gains)
+    gap = float(budget * (found.gains / groups.costs).max() - amounts @ found.gains)
     return Mixture(amounts, found, max(gap, 0.0))
 
 
 @dataclass(frozen=True)
 class WholeMixture:
-    """Whole arrays of the lens types, and their error."""
+    """Whole arrays of the lens types, and what they bring."""
 
     counts: tuple[int, ...]
-    error: float
-    information: float
+    found: Evaluation
 
 
-def best_whole(groups: WaveGroups, readings: float, start: Mixture, most: int) -> list[WholeMixture]:
-    """Return cameras of whole arrays with at most so many readings per pixel of f, the best of those met first.
+Fits = Callable[[tuple[int, ...]], bool]
+
+
+def best_whole(groups: WaveGroups, budget: float, start: Mixture, most: int, fits: Fits) -> list[WholeMixture]:
+    """Return cameras of whole arrays of at most this cost, the best of those met first.
 
     Whole parts of a mixture are completed array by array, then one array is exchanged for another as long as that
-    helps; `most` : number of cameras
+    helps; `most` : number of cameras;  fits : True for numbers of arrays that a camera can have
     """
     known: dict[tuple[int, ...], WholeMixture] = {}
 
-    def error(counts: tuple[int, ...]) -> float:
+    def value(counts: tuple[int, ...]) -> float:
         if counts not in known:
-            found = groups.evaluate(np.array(counts, dtype=np.float64))
-            known[counts] = WholeMixture(counts, found.error, found.information)
-        return known[counts].error
+            known[counts] = WholeMixture(counts, groups.evaluate(np.array(counts, dtype=np.float64)))
+        return known[counts].found.value
 
     counts = tuple(int(part) for part in np.floor(start.amounts + PART))
-    while larger := list(_more(counts, groups.costs, readings)):
-        counts = min(larger, key=error)
+    if not fits(counts):
+        counts = tuple(0 for _ in counts)
+    while larger := list(_more(groups, counts, budget, fits)):
+        counts = min(larger, key=value)
     for _ in range(MOST_ROUNDS):
-        best = min(_exchanged(counts, groups.costs, readings), key=error, default=counts)
-        if not any(counts) or error(best) >= error(counts):
+        best = min(_exchanged(groups, counts, budget, fits), key=value, default=counts)
+        if not any(counts) or value(best) >= value(counts):
             break
         counts = best
-    return sorted(known.values(), key=lambda each: each.error)[:most]
+    return sorted(known.values(), key=lambda each: each.found.value)[:most]
 
 
-def _more(counts: tuple[int, ...], costs: FloatArray, readings: float) -> Iterator[tuple[int, ...]]:
-    """Yield the mixtures of one array more."""
-    for index in range(len(counts)):
+def _more(groups: WaveGroups, counts: tuple[int, ...], budget: float, fits: Fits) -> Iterator[tuple[int, ...]]:
+    """Yield the mixtures of one array more, of which a first estimate expects most."""
+    amounts, found = np.array(counts, dtype=np.float64), 0
+    for index in np.argsort(-groups.falls(amounts), kind="stable").tolist():
         larger = tuple(count + (index == other) for other, count in enumerate(counts))
-        if float(costs @ np.array(larger)) <= readings:
+        if float(groups.costs @ np.array(larger)) <= budget and fits(larger):
             yield larger
+            found += 1
+            if found == TRIED:
+                return
 
 
-def _exchanged(counts: tuple[int, ...], costs: FloatArray, readings: float) -> Iterator[tuple[int, ...]]:
+def _exchanged(groups: WaveGroups, counts: tuple[int, ...], budget: float, fits: Fits) -> Iterator[tuple[int, ...]]:
     """Yield the mixtures in which one array, or none, makes way for another."""
-    yield from _more(counts, costs, readings)
+    yield from _more(groups, counts, budget, fits)
     for index, count in enumerate(counts):
         if count:
             smaller = tuple(each - (index == other) for other, each in enumerate(counts))
-            yield from (each for each in _more(smaller, costs, readings) if each != counts)
+            yield from (each for each in _more(groups, smaller, budget, fits) if each != counts)

@@ -20,7 +20,8 @@ SweepFolder = Annotated[
     Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the table and the plot of --sweep.")
 ]
 DesignFolder = Annotated[
-    Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the scene files of the best cameras.")
+    Path | None,
+    typer.Option("-o", "--output", metavar="DIR", help="Folder of the best cameras and the front."),
 ]
 NoRays = Annotated[
     bool, typer.Option("--no-rays", help="A perfect H and a perfect rendering for every scene: Eq. 5 without rays.")
@@ -75,6 +76,8 @@ def design(
     sets: Sets = None,
     lens: Lenses = "",
     folder: DesignFolder = None,
+    figure_formats: FigureFormats = "",
+    figure_resolution: FigureResolution = SCREEN,
     as_json: Json = False,
 ) -> None:
     """Choose lens types, with a bound on every other choice.
@@ -84,7 +87,7 @@ def design(
     """
     from ommatid.analysis.best_camera import candidates as candidates_of
     from ommatid.analysis.design import magnifications
-    from ommatid.pipeline.descriptions import compare_lens_types, prove_best_camera
+    from ommatid.pipeline.design import compare_lens_types, prove_best_camera
     from ommatid.scenes.scene import read
     from ommatid.scenes.tables.estimation import DesignTable
 
@@ -100,7 +103,9 @@ def design(
             title = f"{title}: the expected error with one more lens type"
         else:
             listed = magnifications((described.design or DesignTable()).magnifications, "design.magnifications")
-            document, rows = prove_best_camera(described, candidates_of(described, listed), folder, progress)
+            figures = options.figure_files(figure_formats, figure_resolution)
+            wanted = candidates_of(described, listed)
+            document, rows = prove_best_camera(described, wanted, folder, figures, progress)
             title = f"{title}: the best camera"
     output.print_result(document, [(title, rows)], as_json)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -272,6 +272,7 @@ class Model:
         return np.bincount(self._rows, weights=entries, minlength=self.measurements).astype(np.float64)
 
 
+@lru_cache(maxsize=1)  # a scene's model is made of it, and reads it again
 def designed_observation(camera: Camera) -> Observation | None:
     """Return H as designed by boxes and kernels; None where it has entries, or kernels that only a model holds."""
     if not camera.has_structure or camera.has_surfaces:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, cast
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from ..geometry.quantities import SensorSize
 from .table import LARGEST, Table
 from .units import AUTO, ExpectedNoise, FillFactor, Length, Memory, Samples, Time, pair
 
@@ -208,7 +209,13 @@ class StudyTable(Table):
 
 
 class DesignTable(Table):
-    """Lens types from which `ommatid design` chooses a camera: every magnification, aperture and fill factor."""
+    """What `ommatid design` chooses a camera from, and for what: every magnification, aperture and fill factor."""
+
+    goal: Literal["error", "information", "resolution"] = Field(
+        default="error",
+        description='"error": the least squared error; "information": most bits in the readings; "resolution": the'
+        " least error of waves with a period below four pixels of f",
+    )
 
     magnifications: str = Field(
         default="1/2,1/3,...,1/9",
@@ -226,6 +233,20 @@ class DesignTable(Table):
         gt=0,
         le=100,
         description="readings per pixel of f, of all lens types together; absent: those of the camera",
+    )
+    sensor_area: SensorSize | None = Field(
+        default=None,
+        description='height and width of the sensor, or a format such as "1/2.3", in place of a number of readings;'
+        " lenses stand as close as their apertures and patches allow",
+    )
+    thickness: Length | None = Field(
+        default=None, description="largest distance from the lenses of a type to its sensor; absent: any"
+    )
+    bits: Annotated[tuple[Annotated[int, Field(ge=1, le=24)], ...], BeforeValidator(pair)] = Field(
+        default=(), max_length=8, description="bits of recorded values, which are compared; absent: those of the scene"
+    )
+    error: float | None = Field(
+        default=None, gt=0, description="squared error to be reached at the least cost; absent: the cost is given"
     )
 
 

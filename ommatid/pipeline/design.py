@@ -1,0 +1,129 @@
+"""`ommatid design`: the best camera of some lens types with its proof, its front and its scene files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ommatid.analysis import design_report
+from ommatid.analysis.best_camera import BestCamera, design_space
+from ommatid.analysis.design import DesignCandidate, DesignComparison, LensCandidate, check_detail, with_lens
+from ommatid.analysis.design_report import FrontPoint, words_of
+from ommatid.analysis.predict import predict_scene
+from ommatid.figures.saving import FigureFiles
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import make_folder
+from ommatid.runtime.progress import Progress
+from ommatid.scenes.scene import Scene, with_tables, write
+from ommatid.scenes.tables.estimation import DesignTable
+from ommatid.scenes.tables.sensor import NoiseTable
+
+Rows = list[tuple[str, str]]
+
+
+def compare_lens_types(scene: Scene, magnifications: Sequence[Fraction], progress: Progress) -> DesignComparison:
+    """Predict the error of the scene with one more lens type of each magnification, with the ideal H."""
+    before = predict_scene(scene, rays=False)
+    candidates: list[DesignCandidate] = []
+    for index, magnification in enumerate(magnifications):
+        try:
+            wider = with_lens(scene, magnification)
+            check_detail(scene, wider)
+            candidates.append(DesignCandidate(str(magnification), predict_scene(wider, rays=False)))
+        except InputError as error:
+            reason = str(error).removeprefix(f"{scene.source}: ")
+            candidates.append(DesignCandidate(str(magnification), None, reason))
+        progress((index + 1) / len(magnifications))
+    candidates.sort(key=lambda candidate: np.inf if candidate.expected is None else candidate.expected.mse)
+    return DesignComparison(before, candidates)
+
+
+def prove_best_camera(
+    scene: Scene, wanted: Sequence[LensCandidate], folder: Path | None, figures: FigureFiles, progress: Progress
+) -> tuple[dict[str, Any], Rows]:
+    """Choose the best camera of some lens types, and return the proof in JSON's types and as rows of a table.
+
+    folder : of the scene files of the best cameras, the front and its figure, None to write none
+    Raises InputError where no bound is known, or an error is out of reach.
+    """
+    table = scene.design or DesignTable()
+    spaces = {bits: design_space(_with_bits(scene, bits), wanted) for bits in table.bits or (None,)}
+    found, wishes = dict[int | None, BestCamera](), dict[int | None, tuple[str, str]]()
+    for bits, space in spaces.items():
+        if table.error is None:
+            found[bits] = space.best(space.budget)
+            continue
+        try:
+            least, found[bits] = space.cheapest(table.error)
+            wishes[bits] = design_report.wish_row(table.error, least, found[bits])
+        except InputError:
+            if bits == max(spaces, key=lambda each: each or 0):
+                raise
+    chosen = min(found, key=lambda bits: _rank(found[bits], bits, table.error is not None))
+    best = found[chosen]
+    made, with_edges = list[Scene | None](), list[float | str]()
+    for number, each in enumerate(best.whole, 1):
+        try:
+            made.append(None)
+            made[-1] = camera = best.space.camera(each.counts)
+            with_edges.append(predict_scene(camera, rays=scene.camera.tolerance is not None).mse)
+        except InputError as error:
+            with_edges.append(str(error).removeprefix(f"{scene.source}: "))
+        progress(number / (len(best.whole) + (folder is not None)))
+    lines = [wishes[chosen]] if chosen in wishes else []
+    lines += design_report.rows(best, with_edges)
+    lines += [design_report.bits_row(bits, each) for bits, each in found.items() if bits is not None]
+    if folder is not None:
+        make_folder(folder)
+        files = {
+            (chosen, words_of(each.counts, best.space)): f"camera{number}.toml"
+            for number, each in enumerate(best.whole, 1)
+        }
+        for name, camera in zip(files.values(), made, strict=True):
+            if camera is not None:
+                write(folder / name, camera)
+        points = [point for bits, space in spaces.items() for point in design_report.front(space, bits)]
+        design_report.write_front(folder / "front.csv", points, [_file(folder, point, files) for point in points])
+        design_report.draw_front(folder / "front.png", points, best, figures)
+        progress(1.0)
+    return {"bits": chosen, **design_report.describe(best, with_edges)}, lines
+
+
+def _rank(best: BestCamera, bits: int | None, wished: bool) -> tuple[float, float]:
+    """Return what is least for the best number of bits: the value or, for a wished error, the bits that are read."""
+    if not best.whole:
+        return np.inf, best.mixture.found.value
+    first = best.whole[0]
+    return (best.space.cost(first) * (bits or 1) if wished else first.found.value), float(bits or 0)
+
+
+def _with_bits(scene: Scene, bits: int | None) -> Scene:
+    """Return the scene with so many bits over the same range of light."""
+    if bits is None:
+        return scene
+    if scene.sensor is None:
+        return with_tables(scene, noise=(scene.noise or NoiseTable()).model_copy(update={"bits": bits}))
+    sensor, finer = scene.sensor, 2.0 ** (bits - scene.sensor.bits)
+    full = None if sensor.saturation is None else max(round(sensor.saturation * finer), 1)
+    changed = {"bits": bits, "gain": sensor.gain * finer, "black_level": sensor.black_level * finer, "saturation": full}
+    return with_tables(scene, sensor=sensor.model_copy(update=changed))
+
+
+def _file(folder: Path, point: FrontPoint, files: dict[tuple[int | None, str], str]) -> str:
+    """Return the scene file of the camera of a point, "" without one; it is written unless another point has it."""
+    if point.camera is None:
+        return ""
+    space = point.best.space
+    key = point.bits, words_of(point.camera.counts, space)
+    if key not in files:
+        try:
+            camera = space.camera(point.camera.counts)
+        except InputError:
+            return ""
+        files[key] = f"front{len(files) + 1}.toml"
+        write(folder / files[key], camera)
+    return files[key]

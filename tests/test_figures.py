@@ -119,6 +119,15 @@ def test_the_best_camera(ommatid: Command) -> None:
     check_figures("camera.md", "and its error is {} times larger.", thin["cameras"][0]["mse"] / best["mse"])
 
 
+def test_steered_windows(ommatid: Command) -> None:
+    noise = "--set", "noise.variance=1"
+    found = json.loads(ommatid("design", "tile19", *noise, "--steer", "6,6,7,7", "--json").out)
+    last, bound = found["windows"][-1]["weighted_mse"], found["bound"]
+    check_figures("camera.md", "lower the expected error from {} to {}.", found["before"], last)
+    check_figures("camera.md", "No choice of four such windows one pixel apart falls below {}:", bound)
+    check_figures("camera.md", "the choice is {} % from the best at most.", 100 * (last / bound - 1))
+
+
 def test_the_photograph_of_the_readme() -> None:
     camera = camera_of("photo")
     check_figures("README.md", "it shows {} pixels reconstructed from fifty", camera.unknowns)

@@ -34,8 +34,8 @@ Goal = Literal["error", "information", "resolution"]
 TIGHT = 1e-5  # gap relative to the value, at which the steps end
 MOST_EXCHANGES = 400  # of costs between two lens types
 STEPS = 6  # between two exchanges
-PARTS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)  # of a type's cost that an exchange tries to give away
-FIRST = 3  # lens types of the first mixture
+PARTS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.001)  # of a type's cost that an exchange tries to give away
+LEAST = 1e-3  # of the largest amount, below which a lens type leaves a mixture
 PART = 0.01  # of an array, from which a lens type belongs to a mixture
 MOST_ROUNDS = 50  # of exchanges of whole arrays
 TRIED = 8  # lens types that are evaluated for the place of one array
@@ -54,7 +54,8 @@ class Evaluation:
 class WaveGroups:
     """What each lens type tells of every group of waves.
 
-    rows : (rows, groups, waves) (w_t P)^1/2 b_t;  pixels : (groups, waves) P^1/2 a;  owners : (rows,) lens types
+    rows : (groups, rows, waves) (w_t P)^1/2 b_t;  owners : (rows,) lens types
+    pixels : (groups, waves, sums) P^1/2 a, of one or several weighted sums whose errors are added
     costs : (types,) of an array;  shape : rows and columns of groups, whose waves of f have 0 to 1/2 periods per pixel
     goal : "resolution" is the part of the error in fine waves
     """
@@ -69,25 +70,27 @@ class WaveGroups:
     @classmethod
     def of(cls, bands: Bands, costs: Sequence[float], goal: Goal = "error") -> WaveGroups:
         """Take the groups of a camera that has one array of each lens type."""
-        return cls(*bands.groups(), np.array(costs, dtype=np.float64), bands.shape, goal)
+        rows, pixels, owners = bands.groups()
+        rows = np.ascontiguousarray(rows.transpose(1, 0, 2))
+        return cls(rows, pixels[..., None], owners, np.array(costs, dtype=np.float64), bands.shape, goal)
 
     def only(self, kept: BoolArray) -> WaveGroups:
         """Return the groups with some of the lens types; kept : (types,)."""
         numbers, rows = np.cumsum(kept) - 1, kept[self.owners]
-        return replace(self, rows=self.rows[rows], owners=numbers[self.owners[rows]], costs=self.costs[kept])
+        return replace(self, rows=self.rows[:, rows], owners=numbers[self.owners[rows]], costs=self.costs[kept])
 
     def evaluate(self, amounts: FloatArray) -> Evaluation:
         """Return what these amounts of the lens types bring, in arrays."""
         precision = self._precision(amounts)
-        seen = np.linalg.solve(precision, self.pixels[..., None])[..., 0]
-        error = float(np.einsum("gm,gm->g", self.pixels * self._counted[:, None], seen).mean())
+        seen = np.linalg.solve(precision, self.pixels)
+        error = float(np.einsum("gmc,gmc->g", self.pixels, seen) @ self._counted) / len(self.pixels)
         if self.goal == "information":
             value = -_bits(precision)
-            squares = np.einsum("rgm,gmr->rg", self.rows, np.linalg.solve(precision, self._columns)) / np.log(4)
+            slopes = np.einsum("grm,gmr->gr", self.rows, np.linalg.solve(precision, self._columns)) / np.log(4)
         else:
             value = error
-            squares = np.square(np.einsum("rgm,gm->rg", self.rows, seen)) * self._counted
-        return Evaluation(value, self._by_type(squares.mean(axis=1)), error)
+            slopes = np.square(self.rows @ seen).sum(axis=2) * self._counted[:, None]
+        return Evaluation(value, self._by_type(slopes), error)
 
     def information(self, amounts: FloatArray) -> float:
         """Return the information that the readings hold, in bits per pixel of f."""
@@ -100,21 +103,21 @@ class WaveGroups:
         """
         precision = self._precision(amounts)
         spread = np.linalg.solve(precision, self._columns)
-        within = 1 + np.einsum("rgm,gmr->rg", self.rows, spread)
+        within = 1 + np.einsum("grm,gmr->gr", self.rows, spread)
         if self.goal == "information":
             falls = np.log(within) / np.log(4)
         else:
-            falls = np.square(np.einsum("gm,gmr->rg", self.pixels, spread)) / within * self._counted
-        return self._by_type(falls.mean(axis=1))
+            falls = np.square(self.pixels.swapaxes(1, 2) @ spread).sum(axis=1) / within * self._counted[:, None]
+        return self._by_type(falls)
 
     def errors(self, amounts: FloatArray) -> FloatArray:
         """Return the error of each wave of f, whose mean is that of a pixel: (rows, columns)."""
-        seen = np.linalg.solve(self._precision(amounts), self.pixels[..., None])[..., 0]
-        return np.einsum("gm,gm->g", self.pixels, seen).reshape(self.shape)
+        seen = np.linalg.solve(self._precision(amounts), self.pixels)
+        return np.einsum("gmc,gmc->g", self.pixels, seen).reshape(self.shape)
 
     def _by_type(self, values: FloatArray) -> FloatArray:
-        """Return sums over the rows of each lens type: (types,)."""
-        return np.bincount(self.owners, values, self.costs.size).astype(np.float64)
+        """Return means over the groups, summed over the rows of each lens type: (groups, rows) to (types,)."""
+        return np.bincount(self.owners, values.mean(axis=0), self.costs.size).astype(np.float64)
 
     @property
     def _counted(self) -> FloatArray:
@@ -126,13 +129,13 @@ class WaveGroups:
 
     @property
     def _columns(self) -> FloatArray:
-        return self.rows.transpose(1, 2, 0)
+        return self.rows.swapaxes(1, 2)
 
     def _precision(self, amounts: FloatArray) -> FloatArray:
         """Return I + sum_t x_t w_t P^1/2 b_t b_t^T P^1/2 of every group: (groups, waves, waves)."""
         each = amounts[self.owners]
-        taken = self.rows[each > 0] * np.sqrt(each[each > 0])[:, None, None]
-        return np.eye(self.pixels.shape[1]) + np.matmul(taken.transpose(1, 2, 0), taken.transpose(1, 0, 2))
+        taken = self.rows[:, each > 0] * np.sqrt(each[each > 0])[:, None]
+        return np.eye(self.pixels.shape[1]) + taken.swapaxes(1, 2) @ taken
 
 
 def _bits(precision: FloatArray) -> float:
@@ -154,22 +157,26 @@ class Mixture:
         return self.found.value - self.gap
 
 
-def best_mixture(groups: WaveGroups, budget: float, tight: float = TIGHT) -> Mixture:
-    """Return the mixture of least value that costs so much; tight : gap relative to the value, at which steps end."""
+def best_mixture(groups: WaveGroups, budget: float, tight: float = TIGHT, most: int = MOST_EXCHANGES) -> Mixture:
+    """Return the mixture of least value that costs so much.
+
+    tight : gap relative to the value, at which the steps end;  most : number of exchanges, after which they end, too
+    """
     costs = groups.costs
-    even = groups.evaluate(budget / costs / costs.size)
-    first = np.argsort(-even.gains / costs)[:FIRST]
-    amounts = np.zeros(costs.size)
-    amounts[first] = budget / costs[first] / first.size
-    mixture = _mixture(groups, budget, amounts)
-    for _ in range(MOST_EXCHANGES):
-        if mixture.gap <= tight * abs(mixture.found.value):
-            break
-        mixture = _exchange(groups, budget, mixture)
+    mixture = _mixture(groups, budget, budget / costs / costs.size)
+    bound = mixture.bound
+    for number in range(most + 1):
         for _ in range(STEPS):
             steps = mixture.amounts * np.sqrt(mixture.found.gains / costs)
+            steps[steps < LEAST * steps.max()] = 0.0  # exchanges bring back what was needed
             mixture = _mixture(groups, budget, steps * budget / float(costs @ steps))
-    return mixture
+            bound = max(bound, mixture.bound)
+        if mixture.found.value - bound <= tight * abs(mixture.found.value):
+            break
+        if number < most:
+            mixture = _exchange(groups, budget, mixture)
+            bound = max(bound, mixture.bound)
+    return replace(mixture, gap=mixture.found.value - bound)
 
 
 def _exchange(groups: WaveGroups, budget: float, mixture: Mixture) -> Mixture:

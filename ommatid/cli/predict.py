@@ -31,6 +31,16 @@ Candidates = Annotated[
 ]
 
 
+Steer = Annotated[
+    str,
+    typer.Option(
+        "--steer",
+        metavar="RUN|ROW,COLUMN,ROWS,COLUMNS",
+        help="Place the windows of [design] where they lower a run's errors, or those of a region, most.",
+    ),
+]
+
+
 def predict(
     scene: SceneFile,
     sets: Sets = None,
@@ -73,6 +83,7 @@ def predict(
 def design(
     scene: SceneFile,
     candidates: Candidates = "",
+    steer: Steer = "",
     sets: Sets = None,
     lens: Lenses = "",
     folder: DesignFolder = None,
@@ -87,13 +98,14 @@ def design(
     """
     from ommatid.analysis.best_camera import candidates as candidates_of
     from ommatid.analysis.design import magnifications
-    from ommatid.pipeline.design import compare_lens_types, prove_best_camera
+    from ommatid.pipeline.design import compare_lens_types, prove_best_camera, steer_windows
     from ommatid.scenes.scene import read
     from ommatid.scenes.tables.estimation import DesignTable
 
-    if candidates and folder is not None:
-        raise InputError("design: -o is for the scenes of the best cameras; leave out --candidates, or -o")
+    if candidates and (folder is not None or steer):
+        raise InputError("design: --candidates writes no files and places no windows; leave it out, or -o and --steer")
     added = magnifications(candidates) if candidates else []
+    figures = options.figure_files(figure_formats, figure_resolution)
     described = read(scene, options.changes(sets), options.lens_names(lens))
     title = described.title or scene.stem
     with output.progress_bar("design") as progress:
@@ -101,9 +113,11 @@ def design(
             comparison = compare_lens_types(described, added, progress)
             document, rows = comparison.describe(), comparison.rows()
             title = f"{title}: the expected error with one more lens type"
+        elif steer:
+            document, rows = steer_windows(described, steer, folder, figures)
+            title = f"{title}: windows of further sub-imagers"
         else:
             listed = magnifications((described.design or DesignTable()).magnifications, "design.magnifications")
-            figures = options.figure_files(figure_formats, figure_resolution)
             wanted = candidates_of(described, listed)
             document, rows = prove_best_camera(described, wanted, folder, figures, progress)
             title = f"{title}: the best camera"

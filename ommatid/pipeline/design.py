@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -9,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.analysis import design_report
+from ommatid.analysis import design_report, steering
 from ommatid.analysis.best_camera import BestCamera, design_space
 from ommatid.analysis.design import DesignCandidate, DesignComparison, LensCandidate, check_detail, with_lens
 from ommatid.analysis.design_report import FrontPoint, words_of
 from ommatid.analysis.predict import predict_scene
 from ommatid.figures.saving import FigureFiles
+from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import make_folder
 from ommatid.runtime.progress import Progress
@@ -91,6 +93,28 @@ def prove_best_camera(
         design_report.draw_front(folder / "front.png", points, best, figures)
         progress(1.0)
     return {"bits": chosen, **design_report.describe(best, with_edges)}, lines
+
+
+def steer_windows(
+    scene: Scene, weighted: str, folder: Path | None, figures: FigureFiles
+) -> tuple[dict[str, Any], Rows]:
+    """Place the windows of [design], and return what they bring in JSON's types and as rows of a table.
+
+    weighted : folder of a run, whose error map are the weights;  folder : of the scene and a figure, None to write none
+    Raises InputError.
+    """
+    region = re.fullmatch(r"(\d{1,6}),(\d{1,6}),(\d{1,6}),(\d{1,6})", weighted.replace(" ", ""))
+    if region is not None:
+        row, column, rows, columns = (int(each) for each in region.groups())
+        weights = steering.weights_of(scene, ((row, column), (rows, columns)))
+    else:
+        weights = read_estimate(Path(weighted) / ESTIMATE).channels["variance"].astype(np.float64)
+    steered = steering.steer(scene, weights)
+    if folder is not None:
+        make_folder(folder)
+        write(folder / "steered.toml", steered.scene)
+        steering.draw(folder / "steered.png", steered, weights, figures)
+    return steering.describe(steered), steering.rows(steered)
 
 
 def _rank(best: BestCamera, bits: int | None, wished: bool) -> tuple[float, float]:

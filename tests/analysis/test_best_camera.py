@@ -40,7 +40,8 @@ def periodic(ratios: list[int], side: int, noise: float = NOISE) -> WaveGroups:
     rows = [(np.outer(transfer(ratio, side), transfer(ratio, side)) * (PRIOR / noise) ** 0.5) for ratio in ratios]
     pixels = np.full((side**2, 1), PRIOR**0.5)
     costs = np.ones(len(ratios))
-    return WaveGroups(np.array(rows).reshape(len(ratios), -1, 1), pixels, np.arange(len(ratios)), costs, (side, side))
+    shaped = np.array(rows).reshape(len(ratios), -1).T[..., None]
+    return WaveGroups(shaped, pixels[..., None], np.arange(len(ratios)), costs, (side, side))
 
 
 def anywhere(_: tuple[int, ...]) -> bool:
@@ -171,7 +172,7 @@ REFUSED: dict[str, tuple[str, ...]] = {
     "the least is": ("--set", "design.error=1e-9", "--set", 'design.magnifications="1/3,1/4"'),
     "design.goal is 'information'": ("--set", "design.error=1", "--set", "design.goal=information"),
     "the smallest array takes": ("--set", "design.readings=0.1"),
-    "leave out --candidates": ("--candidates", "1/2", "-o", "x"),
+    "leave it out, or -o": ("--candidates", "1/2", "-o", "x"),
     "at most 200 lens types": (
         "--set",
         f"design.fill_factors={[f'1/{n}' for n in range(2, 21)]}".replace("'", '"'),
@@ -243,7 +244,7 @@ def test_cameras_of_real_lenses_are_those_of_the_scene_s_target() -> None:
     assert len(scene_of(small, candidates(small, [Fraction(1, 3)])).camera.lens) == 1
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, *(pytest.param(each, marks=pytest.mark.slow) for each in range(3, 20))])
+@pytest.mark.parametrize("number", range(20))
 def test_the_best_of_tiny_cameras_is_that_of_all_sets_of_three(number: int) -> None:
     """By matrices of all readings, edges included; no camera is below the bound of their mixtures."""
     side, noise, count = 9 + number % 4, 10.0 ** (number % 5 - 2), 3 + number % 2
@@ -251,8 +252,7 @@ def test_the_best_of_tiny_cameras_is_that_of_all_sets_of_three(number: int) -> N
     types = [LensCandidate(Fraction(ratio)) for ratio in range(2, 2 + count)]
     matrices = [ideal_matrix(derive(scene_of(tiny, [each]))).toarray() * (PRIOR / noise) ** 0.5 for each in types]
     rows, owners = np.concatenate(matrices), np.repeat(np.arange(count), [len(matrix) for matrix in matrices])
-    every = np.broadcast_to(rows[:, None], (len(rows), side**2, side**2))
-    groups = WaveGroups(every, np.eye(side**2) * PRIOR**0.5, owners, np.ones(count), (side, side))
+    groups = WaveGroups(rows[None], np.eye(side**2)[None] * PRIOR**0.5 / side, owners, np.ones(count), (1, 1))
     mixture = best_mixture(groups, 3.0)
     best, *_ = best_whole(groups, 3.0, mixture, 1, anywhere)
     errors: list[float] = []

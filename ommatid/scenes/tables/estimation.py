@@ -248,6 +248,10 @@ class DesignTable(Table):
     error: float | None = Field(
         default=None, gt=0, description="squared error to be reached at the least cost; absent: the cost is given"
     )
+    windows: int = Field(default=4, ge=1, le=100, description="windows to be placed, with --steer")
+    window: Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], BeforeValidator(pair)] = Field(
+        default=(5, 5), description="rows and columns of sensor pixels of each of these windows"
+    )
 
 
 class TilesTable(Table):

@@ -20,8 +20,10 @@ AUTO = "samples 'auto' leave rendering and calibration a few per cent of the noi
 FIXED = "a perfect H and a perfect rendering: fixed samples add to the run's error, by up to a half in the gallery"
 
 
-def predict_scene(scene: Scene, rays: bool = True) -> Prediction:
+def predict_scene(scene: Scene, rays: bool = True, *, picture: bool = True) -> Prediction:
     """Predict the error of a scene's run, or with `rays` False that of its ideal H and a perfect rendering.
+
+    picture : False leaves out the error of the scene's picture without rays, and with it half of the time
 
     Rays of a pilot say what calibration and rendering leave uncertain. They are traced unless `needs_no_rays` is true,
     or no backend traces them. Raises InputError as a run does.
@@ -29,7 +31,7 @@ def predict_scene(scene: Scene, rays: bool = True) -> Prediction:
     setup = Setup.from_scene(scene)
     with one_thread():
         if not rays:
-            return predict_without_rays(setup, (LEFT_OUT,))
+            return predict_without_rays(setup, (LEFT_OUT,), picture=picture)
         if needs_no_rays(setup):
             if not is_adaptive(scene):
                 least = predict_without_rays(setup, (FIXED,))

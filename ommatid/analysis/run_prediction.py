@@ -82,15 +82,18 @@ def predict_run(setup: Setup) -> Prediction:
     )
 
 
-def predict_without_rays(setup: Setup, assumes: tuple[str, ...]) -> Prediction:
+def predict_without_rays(setup: Setup, assumes: tuple[str, ...], *, picture: bool = True) -> Prediction:
     """Predict the error of a perfect rendering and the ideal H.
 
     assumes : what is taken for granted, which the prediction says first
+    picture : False leaves out the error of the scene's picture, where images of the prior alone matter
     Raises InputError where H has no closed form.
     """
     recording, camera = recording_without_rays(setup), setup.camera
     stack, model = recording.stack, recording.model
-    alike = camera.is_sliding and camera.tolerance is None and not leaves_null_space(camera)
+    # In front of detail no wave is hidden exactly, but the error of a picture by nearly hidden ones is its own.
+    null_space = leaves_null_space(camera) and (picture or not camera.has_detail)
+    alike = camera.is_sliding and camera.tolerance is None and not null_space
 
     def work(choice: MethodChoice) -> _Outcome:
         quick = alike and choice.method == "frame"
@@ -98,7 +101,7 @@ def predict_without_rays(setup: Setup, assumes: tuple[str, ...]) -> Prediction:
         if quick and undithered(assumed.noise) is not None:
             # Errors of rounding that measurements share depend on the readings.
             assumed = assumptions_at(stack, model, choice, recording.image, Execution())
-        truth = truth_for(assumed.method, recording.truth, stack.camera)
+        truth = truth_for(assumed.method, recording.truth, stack.camera) if picture else None
         return _Outcome(choice, assumed, assumed.result(truth))
 
     outcome = with_fallback(stack, model, work)

@@ -72,7 +72,7 @@ def prove_best_camera(
         try:
             made.append(None)
             made[-1] = camera = best.space.camera(each.counts)
-            with_edges.append(predict_scene(camera, rays=scene.camera.tolerance is not None).mse)
+            with_edges.append(predict_scene(camera, rays=scene.camera.tolerance is not None, picture=False).mse)
         except InputError as error:
             with_edges.append(str(error).removeprefix(f"{scene.source}: "))
         progress(number / (len(best.whole) + (folder is not None)))

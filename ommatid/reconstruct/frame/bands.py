@@ -156,10 +156,10 @@ class Bands:
         values, vectors = np.linalg.eigh(inner * roots[:, None] * roots)
         return np.maximum(values, 0.0), roots[:, None] * vectors
 
-    def solve(self, image: FloatArray, waves: FloatArray | None = None) -> FloatArray:
+    def solve(self, image: FloatArray, waves: FloatArray | None = None, *, edges: bool = True) -> FloatArray:
         """Return approximately K^-1 r, (F rows, F columns): symmetric, as conjugate gradients need.
 
-        waves : of r under the DCT-II; None: they are computed
+        waves : of r under the DCT-II; None: they are computed;  edges : False leaves out what lacks near them
         """
         scaled = image if isinstance(self.scale, float) else image / self.scale
         if waves is None or scaled is not image:
@@ -170,9 +170,9 @@ class Bands:
             waves = waves * self.spectrum
             self._subtract_seen(waves)
         solved: FloatArray = np.asarray(fft.idctn(waves, 2, norm="ortho", workers=processors(), overwrite_x=True))
-        for strip in self._strips:
+        for strip in self._strips if edges else ():
             strip.add(scaled, solved)
-        for rows, columns, excess in self._corners:
+        for rows, columns, excess in self._corners if edges else ():
             near = scaled[rows, columns]
             solved[rows, columns] += (excess @ near.ravel()).reshape(near.shape)
         return solved if scaled is image else solved / self.scale
@@ -243,7 +243,7 @@ class Bands:
                 along = (self._along(readings, 1 - axis, _is_turned(kernel, 1 - axis)) @ lines.T)[members]
                 along[members < 0] = 0.0
                 values = np.einsum("pxa,kla->kpxl", shares, along, optimize=True)
-                values = values.reshape(len(members), len(shares), -1)
+                values = values.reshape(len(members), len(shares), depth * detail)  # no readings where none reach
                 total += (values.swapaxes(1, 2) @ values).reshape(total.shape)
             yield total
 

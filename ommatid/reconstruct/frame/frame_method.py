@@ -156,7 +156,7 @@ class FrameMethod(Method):
         constant = np.full(self.task.model.unknowns, value)
         right = self.system.apply_prior_precision(constant)
         if self.quick_bands is not None:
-            return self.quick_bands.solve(right.reshape(self.task.shape)).ravel() / value
+            return self.quick_bands.solve(right.reshape(self.task.shape), edges=False).ravel() / value
         start = None if self._nearly is None else value * self._nearly
         return self._solved(right, self.task.settings.accuracy, start).image / value
 

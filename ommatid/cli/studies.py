@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -14,6 +14,10 @@ LONGEST = 1e7  # seconds of a bench
 
 Photograph = Annotated[str, typer.Option("--image", metavar="FILE", help="The photograph of Figure 7, or photo:NAME.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the noise in Figure 7.")]
+Which = Annotated[
+    Literal["lens-diversity", "multiscale"],
+    typer.Option("--which", help="Wood, Rajan and Christensen, or Fu, Litterio, Felzenszwalb and Zia."),
+]
 Seconds = Annotated[
     float,
     typer.Option(
@@ -28,14 +32,22 @@ Seconds = Annotated[
 
 def paper(
     folder: Folder = Path("paper"),
+    which: Which = "lens-diversity",
     image: Photograph = "photo:camera",
     seed: Seed = 0,
     figure_formats: FigureFormats = "",
     figure_resolution: FigureResolution = SCREEN,
     as_json: Json = False,
 ) -> None:
-    """Compute the paper's figures and claims anew."""
+    """Compute the paper's figures and claims anew, or the expected errors of a second one."""
+    from ommatid.paper import multiscale
     from ommatid.paper.paper import rows, write_paper
+
+    if which == "multiscale":
+        with output.progress_bar("paper") as progress:
+            errors = multiscale.write_multiscale(folder, progress)
+        output.print_result(errors, [("Expected errors by pixels of several sizes", multiscale.rows(errors))], as_json)
+        return
 
     figures = options.figure_files(figure_formats, figure_resolution)
     with output.progress_bar("paper") as progress:

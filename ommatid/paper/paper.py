@@ -61,7 +61,7 @@ def _write_all(
     progress(0.8)
     diverse = [computed[DISTORTION_SIDE, THREE], *distortion()]
     _write_numbers(folder, computed, photograph, diverse)
-    write_csv(folder / CLAIMS, ("claim", "source", "holds", "numbers", "remark"), map(_claim_row, claims))
+    write_csv(folder / CLAIMS, ("claim", "source", "holds", "numbers", "remark"), map(claim_row, claims))
     _write_figures(folder, computed, photograph, files)
     figures.draw_distortion(folder / "distortion.png", diverse, DISTORTION_NOISE, files)
     progress(1.0)
@@ -142,7 +142,8 @@ def _trial_rows(trials: Trials) -> Iterable[Row]:
         yield (bits, variance, trials.predicted[level], trials.mean[level], *trials.measured[level])
 
 
-def _claim_row(claim: Claim) -> Row:
+def claim_row(claim: Claim) -> Row:
+    """Return a claim as a row of claims.csv."""
     numbers = "; ".join(f"{name}: {number:.9g}" for name, number in claim.numbers.items())
     return claim.claim, claim.source, claim.holds, numbers, claim.remark
 

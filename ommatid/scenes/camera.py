@@ -237,7 +237,7 @@ class Camera:
 
     @property
     def received(self) -> FloatArray:
-        """Share of the light on each sensor pixel that its open part receives: (M,)."""
+        """What a reading counts of the mean light on its sensor pixel, by its open part and by binning: (M,)."""
         shares = [float(each.light) for each in self.types]
         if all(share == 1 for share in shares):
             return np.broadcast_to(1.0, self.measurements)
@@ -392,5 +392,6 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
     optics = LensOptics(lens.aperture, lens.focus, lens.distortion, surfaces, lens.scale, lens.coating, blur)
     part = scene.camera.fill_factor if lens.fill_factor is None else lens.fill_factor
     light = Fraction(1) if scene.camera.fill_light == "kept" else part[0] * part[1]
+    light *= ratio**2 if scene.camera.binning == "sum" else 1
     lens_type = LensType(lens.name, ratio, lens.array, pixels, lens.step, (0, 0), optics, open=part, light=light)
     return with_steering(lens_type.centred(rows, columns), lens.sub_imager or (), (rows, columns), scene.source)

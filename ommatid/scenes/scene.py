@@ -110,6 +110,10 @@ class Scene(Table):
                 "camera.walls = false leaves H without a closed form: expected calibration.method 'transport', no fit,"
                 f" got '{self.calibration.method}'"
             )
+        if self.camera.binning == "sum" and self.sensor is not None:
+            raise ValueError(
+                "camera.binning 'sum' takes the ideal sensor of [noise], got a [sensor]; remove one of the two"
+            )
         if not self.camera.walls and self.sensor is not None and self.sensor.acceptance is not None:
             raise ValueError("sensor.acceptance needs walls, since light through other lenses comes at other angles")
         if self.light is not None and self.camera.wavelength is not None:

@@ -264,6 +264,12 @@ class CameraTable(Table):
         exclude_if=lambda value: value == "lost",
         description='light beside the open parts; "kept": micro-lenses on the pixels gather the light of the whole',
     )
+    binning: Literal["average", "sum"] = Field(
+        default="average",
+        exclude_if=lambda value: value == "average",
+        description='what a pixel of magnification 1/m reads of its m x m pixels of f: the "average", or the "sum", of'
+        " m x m pixels of a sensor whose charges are added before a reading's noise comes on top",
+    )
     pixel_blur: Length | None = Field(
         default=None,
         exclude_if=lambda value: value is None,

@@ -154,8 +154,8 @@ def assert_student(difference: NDArray[np.float64], variance: NDArray[np.float64
 def mean_weights(renderer: Renderer, group: str, samples: int) -> NDArray[np.float64]:
     """Return the mean weight of each pixel's rays, (pixels,): its relative light from a uniform world."""
     weights = [
-        renderer.hits(group, samples, sampler_seeds(0, "data", 0, 1), block)[1]
-        for block in renderer.blocks(group, samples)
+        renderer.hits(block, samples, sampler_seeds(0, "data", 0, 1))[1]
+        for block in renderer.blocks(renderer.pixels(group), samples)
     ]
     return np.concatenate([weight.mean(axis=1) for weight in weights if weight is not None])
 

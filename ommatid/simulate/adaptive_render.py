@@ -218,13 +218,14 @@ class AdaptiveRounds:
     def exact(self) -> list[list[int]]:
         """Indices of the sub-imagers that have yet to be shown without error; a list of those rendered together.
 
-        They are adjacent, of one lens type and one plan.
+        They are adjacent, of one lens type and one plan; on scalar each is alone.
         """
         waiting = [index for index, sub in enumerate(self.sub_imagers) if self._exact[index] and not sub.rounds]
 
         def kind(numbered: tuple[int, int]) -> tuple[str, Plan | None, int]:
             number, index = numbered
-            return self._camera.sub_imagers[index].type.name, self._exact[index], index - number
+            together = index - number if self._renderer.is_fast else index
+            return self._camera.sub_imagers[index].type.name, self._exact[index], together
 
         return [[index for _, index in alike] for _, alike in groupby(enumerate(waiting), kind)]
 
@@ -234,18 +235,17 @@ class AdaptiveRounds:
         Averages are done, and of a grid pixels whose passes agree: their variance is float32's rounding. The others
         take part in the rounds.
         """
-        work, seed = self.sub_imagers[indices[0]].next, self._scene.render.seed
-        seeds = [sampler_seeds(seed, "data", number, MOST_PASSES) for number in range(work.passes)]
-        rows = slice(self._slices[indices[0]].start, self._slices[indices[-1]].stop)
-        for part, values in self._renderer.expose_exactly(indices, work, seeds):
-            tally = Tally(part.stop - part.start)
-            for passed in values:
-                tally.add(passed)
-            mean, variance = tally.mean, tally.variance
-            floor = rounding_variance(mean, self._renderer.float32_samples(work.samples))
-            self.mean[part], self.variance[part] = mean, np.maximum(variance, floor)
-            self._open[part] = (variance > floor) & (work != AVERAGED)
-            yield (part.stop - rows.start) / (rows.stop - rows.start)
+        work, renderer, done = self.sub_imagers[indices[0]].next, self._renderer, 0
+        seeds = [sampler_seeds(self._scene.render.seed, "data", number, MOST_PASSES) for number in range(work.passes)]
+        pixels, averaged = renderer.sub_imagers(indices), work == AVERAGED
+        for block in renderer.blocks(pixels, 1 if averaged else work.total):
+            start = self._slices[indices[0]].start + done
+            part, done = slice(start, start + block.count), done + block.count
+            tally = Tally.of(renderer.expose(block, work.samples, seeds, "averages" if averaged else "grid")[0])
+            floor = rounding_variance(tally.mean, renderer.float32_samples(work.samples))
+            self.mean[part], self.variance[part] = tally.mean, np.maximum(tally.variance, floor)
+            self._open[part] = (tally.variance > floor) & (not averaged)
+            yield done / pixels.count
         for index in indices:
             self.sub_imagers[index] = self._after_exact(index, work)
 
@@ -274,16 +274,10 @@ class AdaptiveRounds:
                 self._end(sub, index, TIME)
                 self.sub_imagers[index] = sub
                 return
-        seed, first = self._scene.render.seed, sub.seeds
-        tally = Tally(pixels.size)
-        for values in self._renderer.expose_alone(
-            index,
-            pixels,
-            work,
-            lambda number: sampler_seeds(seed, "data", first + number, MOST_PASSES)(index),
-            self._sobol[index],
-        ):
-            tally.add(values)
+        seed, numbers = self._scene.render.seed, range(sub.seeds, sub.seeds + work.passes)
+        seeds = [sampler_seeds(seed, "data", number, MOST_PASSES) for number in numbers]
+        chosen, points = self._renderer.sub_imagers([index], pixels), "sobol" if self._sobol[index] else "sampler"
+        tally = Tally.of(self._renderer.expose(chosen, work.samples, seeds, points)[0])
         floor = self._floor(index, tally.mean, work.samples)
         self.mean[start + pixels] = tally.mean
         self.variance[start + pixels] = np.maximum(posterior_variances(tally.variance, work.passes), floor)

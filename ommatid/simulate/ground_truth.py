@@ -57,10 +57,9 @@ def truth(setup: Setup) -> Truth:
     renderer = Renderer(ideal_camera(camera).world, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     seeds = [sampler_seeds(scene.render.seed, "truth", number, work.passes + 1) for number in range(work.passes + 1)]
-    tally = Tally(camera.unknowns)
+    tally, (pixels,) = Tally(camera.unknowns), map(renderer.pixels, renderer.groups)
     for seed in seeds[:-1]:
-        (group,) = renderer.groups
-        tally.add(renderer.expose(group, work.samples, seed)[0])
+        tally.add(renderer.expose(pixels, work.samples, [seed])[0, 0])
     points = renderer.depths(ideal_camera(camera, FINER), seeds[-1](0))
     depth = np.median(points.reshape(camera.rows, FINER, camera.columns, FINER), axis=(1, 3))
     return Truth(

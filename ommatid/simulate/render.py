@@ -29,6 +29,7 @@ from ommatid.scenes.shrinkage import posterior_variances_among
 from ommatid.scenes.stack import STRAIGHT, Stack, stack_from_recording
 from ommatid.scenes.tables.sensor import SensorTable
 
+from .renderer.rays import Pixels
 from .renderer.renderer import Renderer
 from .renderer.variant import choose, release
 from .sampling.checkpoint import Checkpoint, State, open_checkpoint
@@ -37,8 +38,6 @@ from .world_view import rendered_world
 
 NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle
 BAND = 2**22  # sensor pixels, at most, unless rays that start together are of more
-
-Part = tuple[str, slice]  # group, and pixels of it
 
 
 @dataclass(frozen=True)
@@ -195,36 +194,31 @@ def render_bands(
     if state:
         mean, variance, first = state["mean"], state["variance"], int(state["band"])
     for number, band in list(enumerate(bands))[first:]:
-        tally = Tally(sum(pixels.stop - pixels.start for _, pixels in band))
+        tally = Tally(sum(pixels.count for pixels in band))
         tally.resume("light", state)
         state = State()  # the other bands have not begun
         for index in range(tally.count, work.passes):
-            seeds = sampler_seeds(seed, "data", index, work.passes)
-            parts = [renderer.expose(group, work.samples, seeds, block=part)[0] for group, part in band]
-            tally.add(np.concatenate(parts))
+            seeds = [sampler_seeds(seed, "data", index, work.passes)]
+            tally.add(np.concatenate([renderer.expose(pixels, work.samples, seeds)[0, 0] for pixels in band]))
             if checkpoint is not None:
                 done = {"mean": mean, "variance": variance, "band": np.array(number)}
                 checkpoint.offer(lambda done=done, tally=tally: {**done, **tally.state("light")})
             progress((number + (index + 1) / work.passes) / len(bands))
-        start = renderer.rows(band[0][0]).start + band[0][1].start
+        start = renderer.rows(band[0].group).start + band[0].block.start
         rows = slice(start, start + tally.mean.size)
         mean[rows], variance[rows] = tally.mean, tally.variance
     return mean, variance
 
 
-def bands_of(renderer: Renderer, samples: int) -> list[list[Part]]:
+def bands_of(renderer: Renderer, samples: int) -> list[list[Pixels]]:
     """Join the adjacent blocks of pixels whose rays start together to bands."""
-    bands, pixels = list[list[Part]](), 0
-    for group in renderer.groups:
-        rows = renderer.rows(group)
-        whole = [slice(0, rows.stop - rows.start)]
-        for block in renderer.blocks(group, samples) if renderer.is_fast else whole:
-            size = block.stop - block.start
-            if not bands or pixels + size > BAND:
-                bands.append([])
-                pixels = 0
-            bands[-1].append((group, block))
-            pixels += size
+    bands, size = list[list[Pixels]](), 0
+    for block in (block for group in renderer.groups for block in renderer.blocks(renderer.pixels(group), samples)):
+        if not bands or size + block.count > BAND:
+            bands.append([])
+            size = 0
+        bands[-1].append(block)
+        size += block.count
     return bands
 
 

@@ -264,8 +264,8 @@ def coarse_camera(camera: Camera) -> Camera:
 def _brightest(renderer: Any, seed: int) -> float:
     """Return the radiance that all but the brightest pixels of a coarse picture stay below; 0 if there is no light."""
     (group,) = renderer.groups
-    seeds = sampler_seeds(seed, "white", 0, 1)
-    radiance = renderer.expose(group, SAMPLES, seeds)[0] / WHITE  # where a radiance of 1 is white
+    seeds = [sampler_seeds(seed, "white", 0, 1)]
+    radiance = renderer.expose(renderer.pixels(group), SAMPLES, seeds)[0, 0] / WHITE  # where a radiance of 1 is white
     white = float(np.percentile(radiance, BRIGHT))
     return white if 0 < white < np.inf else 0.0
 

@@ -81,9 +81,9 @@ def _ours(camera: Camera, picture: FloatArray, variant: str, samples: int) -> Re
 
     def expose(seed: int) -> FloatArray:
         # A different seed for each sensor, or their noise would be correlated.
-        return np.concatenate(
-            [renderer.expose(group, samples, lambda index: 1000 * seed + index)[0] for group in renderer.groups]
-        )
+        seeds = [lambda index: 1000 * seed + index]
+        every = [renderer.expose(renderer.pixels(group), samples, seeds)[0, 0] for group in renderer.groups]
+        return np.concatenate(every)
 
     return expose
 

@@ -29,6 +29,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import stack_from_recording
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import light
+from ommatid.simulate.sampling.passes import Plan
 from ommatid.simulate.sensors import record
 
 from ..examples import THREE, TWO, familywise, needs, scene, with_optics
@@ -119,9 +120,9 @@ def test_the_reduced_rendering_draws_fewer_random_numbers(rule: str) -> None:
     for each in (reduced, camera):
         renderer = Renderer(each, "llvm_ad_mono")
         drawn = [0]
-        for generator in renderer._generators.values():  # pyright: ignore[reportPrivateUsage]
+        for group, generator in renderer._generators.items():  # pyright: ignore[reportPrivateUsage]
             generator.sampler = Counting(generator.sampler, drawn)
-            generator.rays(16, 0, generator.blocks(16)[0])
+            generator.sampled(renderer.pixels(group), Plan(1, 16), 0)
         counts.append(drawn[0] // len(renderer.groups))
     assert counts[0] == 1, "only the position in the pixel"
     assert counts[1] == 2

@@ -69,7 +69,7 @@ def test_samples_keep_away_from_edges_by_what_float32_rounds(monkeypatch: pytest
     expected, seeds = block_means(setup), [lambda index: 10 + index, lambda index: 20 + index]
 
     def wrong() -> int:
-        ((_, values),) = renderer.expose_exactly(range(4), Plan(2, 9), seeds)
+        values = renderer.expose(renderer.sub_imagers(range(4)), 9, seeds, "grid")[0]
         return int(((values - expected) ** 2 > 16 * rounding_variance(expected, 1)).sum())
 
     assert wrong() == 0

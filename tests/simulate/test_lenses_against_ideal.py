@@ -108,9 +108,8 @@ def test_rays_in_a_world_have_the_pattern_of_their_surface_s_distance(kind: str,
         generator.follow(distance_to_target(renderer), MILLIMETRES_AT_ORIGIN)
     rows = renderer.rows(group)
     total = sparse.csr_array((rows.stop - rows.start, camera.unknowns))
-    (block,) = renderer.blocks(group, work.samples)
     for number in range(work.passes):
-        total = total + one_pass(renderer, group, block, work, number, described.render.seed).matrix
+        total = total + one_pass(renderer, renderer.pixels(group), work, number, described.render.seed).matrix
     found = scores(sparse.csr_array(total / work.passes), ideal_matrix(camera)[rows], samples)
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)

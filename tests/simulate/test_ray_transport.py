@@ -39,12 +39,12 @@ def test_a_column_of_h_is_the_picture_of_its_point_source(kind: str) -> None:
     setup = Setup(*with_optics(*optics, SMALL, (7, 7), calibration={"samples": 32}, render={"complete": True}))
     renderer, work = Renderer(setup.simulated, "llvm_ad_mono", "multijitter", together=False), Plan(2, 16)
     for group in renderer.groups:
-        (block,) = renderer.blocks(group, work.samples)
-        entries = one_pass(renderer, group, block, work, 0, 0).matrix.toarray()
-        seeds = sampler_seeds(0, "calibration", 0, work.passes)
+        pixels = renderer.pixels(group)
+        entries = one_pass(renderer, pixels, work, 0, 0).matrix.toarray()
+        seeds = [sampler_seeds(0, "calibration", 0, work.passes)]
         for texel, column in enumerate(entries.T):
             renderer.set_target((np.arange(49) == texel).astype(float).reshape(7, 7))
-            seen = renderer.expose(group, work.samples, seeds)[0]
+            seen = renderer.expose(pixels, work.samples, seeds)[0, 0]
             np.testing.assert_allclose(np.nan_to_num(seen), column, atol=1e-6)
         assert entries.sum() > 0.8 * len(entries)
         renderer.set_target(np.ones((7, 7)))

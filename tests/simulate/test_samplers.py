@@ -60,9 +60,9 @@ def errors(
     renderer.set_target(image)
     values = np.empty((repeats, seen.measurements))
     for number in range(repeats):
-        seeds = sampler_seeds(5, "data", number, repeats)
+        seeds = [sampler_seeds(5, "data", number, repeats)]
         for group in renderer.groups:
-            values[number, renderer.rows(group)] = renderer.expose(group, samples, seeds)[0]
+            values[number, renderer.rows(group)] = renderer.expose(renderer.pixels(group), samples, seeds)[0, 0]
     return (values - ideal_matrix(seen) @ image.ravel())[:, :450]
 
 

@@ -17,7 +17,7 @@ from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.draws import DIMENSIONS, SobolDraws, sobol_points
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate
-from ommatid.simulate.sampling.passes import Plan, power_of_two_plan
+from ommatid.simulate.sampling.passes import power_of_two_plan
 
 from ..examples import needs, with_optics
 
@@ -92,8 +92,8 @@ def variance(sampler: Sampler, sobol: bool) -> float:
     renderer = Renderer(setup.simulated, FAST, sampler)
     renderer.set_target(setup.image)
     seeds = [sampler_seeds(1, "data", number, 40) for number in range(40)]
-    work, pixels = Plan(40, 1024), np.arange(25)
-    passes = [renderer.expose_alone(index, pixels, work, lambda n, k=index: seeds[n](k), sobol) for index in range(4)]
+    points = "sobol" if sobol else "sampler"
+    passes = [renderer.expose(renderer.sub_imagers([index]), 1024, seeds, points)[0] for index in range(4)]
     return float(np.concatenate(passes, axis=1).var(axis=0, ddof=1).mean())
 
 

@@ -116,7 +116,7 @@ def test_rays_that_follow_the_distance_of_what_they_meet(kind: str) -> None:
     renderer = Renderer(camera, "llvm_ad_mono", "independent", together=False)
     scene: Any = renderer
     scene._generators["A"].lens.follow(distance_to_target(renderer))
-    texels, weights = renderer.hits("A", 4 * SAMPLES, lambda index: index + 7, slice(0, camera.measurements))
+    texels, weights = renderer.hits(renderer.pixels("A"), 4 * SAMPLES, lambda index: index + 7)
     assert weights is not None
     found = np.zeros((camera.measurements, camera.unknowns + 1))
     np.add.at(found, (np.arange(camera.measurements)[:, None], texels), weights)

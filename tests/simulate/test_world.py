@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.simulate.ground_truth import truth
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import Rendering, cached_stack, light
+from ommatid.simulate.renderer.rays import Pixels, Seed
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.world import files, has_interreflections, stage
 
@@ -72,9 +73,9 @@ def test_the_ground_truth_shares_no_ray_with_the_data(tmp_path: Path, monkeypatc
     started: list[set[int]] = []
     exposed = Renderer.expose
 
-    def expose(self: Renderer, group: str, samples: int, seed: Callable[[int], int], **rest: Any) -> Any:
-        started[-1].update(map(seed, range(len(camera.sub_imagers))))
-        return exposed(self, group, samples, seed, **rest)
+    def expose(self: Renderer, pixels: Pixels, samples: int, seeds: Sequence[Seed]) -> Any:
+        started[-1].update(seed(index) for seed in seeds for index in range(len(camera.sub_imagers)))
+        return exposed(self, pixels, samples, seeds)
 
     monkeypatch.setattr(Renderer, "expose", expose)
     for make in (truth, light):

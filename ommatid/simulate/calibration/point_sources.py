@@ -9,7 +9,6 @@ of a row of H cancel in its sum; none is shared with the data.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from math import ceil, floor
@@ -159,7 +158,7 @@ class SourceSweep:
 
     def __init__(self, renderer: Renderer, group: str, subset: IntArray | None = None) -> None:
         """Create an empty sweep of the pixels of a group, or of a subset of them."""
-        self._renderer, self._group, self._subset = renderer, group, subset
+        self._renderer, self._group, self._pixels = renderer, group, renderer.pixels(group, subset)
         self.visible = visible_pixels(renderer, group, subset)
         shape = self.visible.row.size, self.visible.spacing**2
         self.tally, self.uniform = Tally(*shape), Tally(shape[0])
@@ -182,23 +181,20 @@ class SourceSweep:
         levels = brightness(work.samples, renderer.exact_below)
         offsets, together = spacing**2, renderer.channels * levels.size
         values = np.empty(self.tally.mean.shape)
-        pass_seeds = sampler_seeds(seed, "calibration", number, work.passes)
+        seeds = [sampler_seeds(seed, "calibration", number, work.passes)]
         for first in range(0, offsets, together):
             chunk = range(first, min(first + together, offsets))
             channels = [chunk[start : start + levels.size] for start in range(0, len(chunk), levels.size)]
             renderer.set_target(*(_sources(renderer.camera, spacing, shown, levels) for shown in channels))
-            readings = self._read(work.samples, pass_seeds)
+            readings = renderer.expose(self._pixels, work.samples, seeds)[:, 0]
             for shown, reading in zip(channels, readings, strict=False):
                 alone = reading[:, None] if levels.size == 1 else separate_sources(reading, work.samples, levels)
                 values[:, shown] = alone[:, : len(shown)]
             progress((number + chunk.stop / offsets) / work.passes)
         renderer.set_target(np.ones(renderer.camera.shape))
-        self.uniform.add(self._read(work.samples, pass_seeds)[0])
+        self.uniform.add(renderer.expose(self._pixels, work.samples, seeds)[0, 0])
         self.batches[number % BATCHES] += (values * (BATCHES / work.passes)).astype(np.float32)
         self.tally.add(values)
-
-    def _read(self, samples: int, seeds: Callable[[int], int]) -> FloatArray:
-        return self._renderer.expose(self._group, samples, seeds, self._subset)
 
     def part(self, work: Plan) -> Part:
         """Return the rows of H. Raises MachineError."""

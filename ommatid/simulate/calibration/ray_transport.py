@@ -23,6 +23,7 @@ from ..sampling.passes import BATCHES, Plan
 from .point_sources import Part, Plans, Responses, Subsets, joined_parts, same_plans
 
 if TYPE_CHECKING:
+    from ..renderer.rays import Pixels
     from ..renderer.renderer import Renderer
 
 
@@ -50,32 +51,28 @@ def responses_from_rays(
     parts: dict[str, list[Part]] = {group: [] for group in renderer.groups}
     chosen: Subsets = dict.fromkeys(renderer.groups) if subsets is None else subsets
     blocks = [
-        (group, block)
+        block
         for group in renderer.groups
         if group in chosen
-        for block in renderer.blocks(group, plans[group].samples, chosen[group])
+        for block in renderer.blocks(renderer.pixels(group, chosen[group]), plans[group].samples)
     ]
-    for index, (group, block) in enumerate(blocks):
+    for index, block in enumerate(blocks):
         passes: list[TracedEntries] = []
-        work = plans[group]
+        work = plans[block.group]
         for number in range(work.passes):
-            passes.append(one_pass(renderer, group, block, work, number, scene.render.seed, chosen[group]))
+            passes.append(one_pass(renderer, block, work, number, scene.render.seed))
             progress((index + (number + 1) / work.passes) / len(blocks))
-        parts[group].append(_joined(passes, (block.stop - block.start, setup.camera.unknowns)))
+        parts[block.group].append(_joined(passes, (block.count, setup.camera.unknowns)))
     return joined_parts(renderer, parts, chosen, plans, variant, scene.render.seed)
 
 
-def one_pass(
-    renderer: Renderer, group: str, block: slice, work: Plan, number: int, seed: int, subset: IntArray | None = None
-) -> TracedEntries:
-    """Trace one pass of the pixels of a block, of all or of a subset."""
-
-    seeds = sampler_seeds(seed, "calibration", number, work.passes)
-    texels, weights = renderer.hits(group, work.samples, seeds, block, subset)
+def one_pass(renderer: Renderer, pixels: Pixels, work: Plan, number: int, seed: int) -> TracedEntries:
+    """Trace one pass of some pixels whose rays start together."""
+    texels, weights = renderer.hits(pixels, work.samples, sampler_seeds(seed, "calibration", number, work.passes))
     weights = np.ones(texels.shape) if weights is None else weights
     total = weights.sum(axis=1)
     matrix = sums_by_texel(texels, weights, renderer.camera.unknowns)
-    matrix.data *= np.repeat(renderer.captured(group) / np.where(total > 0, total, 1.0), np.diff(matrix.indptr))
+    matrix.data *= np.repeat(renderer.captured(pixels.group) / np.where(total > 0, total, 1.0), np.diff(matrix.indptr))
     return TracedEntries(matrix, total == 0)
 
 

@@ -1,5 +1,8 @@
 """Random numbers of rays: Mitsuba's sampler with a seed for every draw, Sobol's points, and points in cells of a grid.
 
+Each kind is a class: `position` is where a ray starts in the open part of its pixel, `next_1d` and `next_2d` are the
+numbers that lenses draw, and `spreads` is True if more rays, with less weight, go to faint parts of the point spread.
+
 Mitsuba's stratified, multijitter and ldsampler number the permutations of successive draws: seed, seed + 1, ... Its
 permutations of related numbers are related, so that some cells of the pupil hardly ever belong to some cells of the
 pixel, in every pass. The mean over passes is then off by up to one standard deviation of a pass's mean, which the
@@ -18,13 +21,13 @@ sub-imagers are rendered together.
 # pyright: basic
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.runtime.arrays import IntArray
 from ommatid.runtime.streams import draw_seed
 
 DIMENSIONS = 8  # of the points; what a ray draws beyond them is independent
@@ -37,11 +40,17 @@ GRID_ROUNDS = 4  # of the Tiny Encryption Algorithm, after which its numbers pas
 
 
 class ReseededSampler:
-    """Draws numbers for what follows the position in the pixel."""
+    """Draws the position from Mitsuba's sampler as it is, and all other numbers from it with seeds of their own."""
+
+    spreads = False
 
     def __init__(self, sampler: Any, seed: int, lanes: int) -> None:
         """Wrap Mitsuba's sampler, which was seeded with `seed` for `lanes` rays."""
         self._sampler, self._seed, self._lanes, self._draws = sampler, seed, lanes, 0
+
+    def position(self) -> Any:
+        """Return the point of the pixel's open part where every ray starts."""
+        return self._sampler.next_2d()
 
     def next_1d(self) -> Any:
         """Draw a number for every ray."""
@@ -75,11 +84,19 @@ def sobol_points(samples: int) -> NDArray[np.uint32]:
 class SobolDraws:
     """Draws numbers for every ray, dimension after dimension. Like Mitsuba's samplers, without their state."""
 
-    has_drawn = False  # Mitsuba's sampler has drawn nothing
+    def __init__(self, seed: int, lanes: int, samples: int, *, middle: bool = False) -> None:
+        """Begin with the first dimension; `samples`, a power of two, are adjacent of `lanes` rays.
 
-    def __init__(self, seed: int, lanes: int, samples: int) -> None:
-        """Begin with the first dimension; `samples`, a power of two, are adjacent of `lanes` rays."""
+        middle : True starts all rays in the middle of the pixel, for a picture that is averaged over the pixel
+        """
         self._seed, self._lanes, self._samples, self._dimension = seed, lanes, samples, 0
+        self.spreads = middle
+
+    def position(self) -> Any:
+        """Return the point of the pixel's open part where every ray starts."""
+        import mitsuba as mi
+
+        return mi.Point2f(0.5) if self.spreads else self.next_2d()
 
     def next_2d(self) -> Any:
         """Draw two numbers for every ray."""
@@ -120,27 +137,36 @@ def _reversed(value: Any) -> Any:
     return value
 
 
-@dataclass(frozen=True)
-class Grid:
-    """`cells` x `cells` cells over a pixel; points keep a `margin`, relative to the cell's side, to its edges."""
+class GridDraws:
+    """One point in every cell of a grid over the pixel, for pinholes, which draw no other numbers."""
 
-    cells: int
-    margin: float
+    spreads = False
 
-    def position(self, lane: Any, key: Any, number: Any) -> Any:
-        """Return a point in [0, 1)^2 for each lane, whose adjacent ones are the cells of one pixel, by rows.
+    def __init__(self, cells: int, margin: float, keys: IntArray, numbers: IntArray) -> None:
+        """Create `cells` x `cells` points for each pixel and pass, whose numbers follow from these alone.
 
-        key : of the pixel's sub-imager and pass;  number : of the pixel in its sub-imager
+        margin : to the edges of the cells, relative to their side
+        keys : (pixels, passes) of 32 bits, of the pixel's sub-imager;  numbers : (pixels,) within the sub-imager
         """
+        self._cells, self._margin, self._keys, self._numbers = cells, margin, keys, numbers
+
+    def position(self) -> Any:
+        """Return the point of the pixel's open part where every ray starts: the cells of a pixel by rows."""
         import drjit as dr
         import mitsuba as mi
 
-        cells = dr.opaque(mi.UInt32, self.cells)
+        pixels, passes = self._keys.shape
+        lane: Any = dr.arange(mi.UInt32, pixels * passes * self._cells**2)
+        of_pass = lane // dr.opaque(mi.UInt32, self._cells**2)
+        key: Any = dr.gather(mi.UInt32, mi.UInt32(self._keys.astype(np.uint32).ravel()), of_pass)
+        numbers = mi.UInt32(self._numbers.astype(np.uint32))
+        number: Any = dr.gather(mi.UInt32, numbers, of_pass // dr.opaque(mi.UInt32, passes))
+        cells: Any = dr.opaque(mi.UInt32, self._cells)
         cell = lane % (cells * cells)
         row, first = cell // cells, mi.sample_tea_32(number, key, GRID_ROUNDS)
         draws = mi.sample_tea_32(first[0] + cell, first[1], GRID_ROUNDS)
         u, v = (mi.Float(draw >> (32 - MANTISSA)) * 2.0**-MANTISSA for draw in draws)
-        margin, free = dr.opaque(mi.Float, self.margin), dr.opaque(mi.Float, 1 - 2 * self.margin)
-        inverse: Any = dr.opaque(mi.Float, 1 / self.cells)
+        margin, free = dr.opaque(mi.Float, self._margin), dr.opaque(mi.Float, 1 - 2 * self._margin)
+        inverse: Any = dr.opaque(mi.Float, 1 / self._cells)
         column = cell - row * cells
         return mi.Point2f((column + margin + free * u) * inverse, (row + margin + free * v) * inverse)

@@ -17,7 +17,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import write_truth
-from ommatid.scenes.lens_type import LensType, SubImager
+from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import Sampler
 
@@ -76,17 +76,12 @@ def stock_sensor(
     }
 
 
-def stock_sensors(
-    camera: Camera, types: tuple[LensType, ...], sampler: Sampler, channels: int, far: float, placement: Placement
-) -> dict[int, Any]:
-    """Create Mitsuba's sensors of the sub-imagers of some lens types, by their number in the camera."""
+def stock_sensors(camera: Camera, sampler: Sampler, channels: int, far: float, placement: Placement) -> list[Any]:
+    """Create Mitsuba's sensors of all sub-imagers, in their order in the camera."""
     import mitsuba as mi
 
-    return {
-        index: mi.load_dict(stock_sensor(camera, sub, sampler, 16, channels, far, placement))
-        for index, sub in enumerate(camera.sub_imagers)
-        if sub.type in types
-    }
+    subs = camera.sub_imagers
+    return [mi.load_dict(stock_sensor(camera, sub, sampler, 16, channels, far, placement)) for sub in subs]
 
 
 def film(width: int, height: int, channels: int = 1) -> dict[str, Any]:

@@ -10,7 +10,8 @@ lens. Lengths are millimetres.
 # pyright: basic
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,45 @@ from ommatid.scenes.tables.estimation import Sampler
 
 from ..sampling.passes import Plan
 from ..sampling.samplers import RELATED_DRAWS, fitting
-from .draws import Grid, ReseededSampler, SobolDraws
+from .draws import GridDraws, ReseededSampler
 from .lens import Distance, LensModel, ThinLens
 from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each
+
+
+Seed = Callable[[int], int]  # of a sampler, by the index of a sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Sensor pixels of a group of lens types that are rendered together: `block` of all of them, or of `subset`.
+
+    sensor : index of the sensor that seeds their sampler on the fast backends: of the group, or of a sub-imager
+    """
+
+    group: str
+    block: slice
+    subset: IntArray | None = None
+    sensor: int = 0
+
+    @property
+    def count(self) -> int:
+        """Number of pixels."""
+        return self.block.stop - self.block.start
+
+    @property
+    def numbers(self) -> IntArray:
+        """Their numbers in the group, rising: (pixels,)."""
+        return np.arange(self.block.start, self.block.stop) if self.subset is None else self.subset[self.block]
+
+    def blocks(self, samples: int) -> list[Pixels]:
+        """Divide them into blocks whose rays, `samples` a pixel, start together and fit into memory."""
+        size, stop = max(1, MOST_RAYS // samples), self.block.stop
+        if self.count <= size:
+            return [self]  # whose places are loaded once for all passes
+        starts = range(self.block.start, stop, size)
+        return [replace(self, block=slice(first, min(first + size, stop))) for first in starts]
 
 
 @dataclass(frozen=True)
@@ -63,9 +98,8 @@ class RayGenerator:
         self.sampler: Any = mi.load_dict({"type": sampler, "sample_count": fitting(sampler, 16)})
         self.lens = lens_of(camera, types[0])
         self._places = PixelPlaces(camera, types)
-        self.pixels = self._places.count
         self._placement = MILLIMETRES_AT_ORIGIN
-        self._loaded: tuple[slice, list[Any], Any] | None = None  # of the last block of all pixels
+        self._loaded: tuple[Pixels, list[Any], Any] | None = None  # of the last pixels
         self._pitch = float(camera.pixel_pitch)
         # The same for all of these types:
         self._open, self._height = [float(part) for part in types[0].open], camera.height(types[0])
@@ -87,112 +121,63 @@ class RayGenerator:
         (self._crossing or self.lens).follow(from_lens)
         self.lens.captured = 1.0 if self._crossing is not None else self.lens.captured
 
-    def blocks(self, samples: int, pixels: int | None = None) -> list[slice]:
-        """Divide all pixels, or `pixels` of them, into blocks whose rays start together and fit into memory."""
-        size, count = max(1, MOST_RAYS // samples), self.pixels if pixels is None else pixels
-        return [slice(first, min(first + size, count)) for first in range(0, count, size)]
-
-    def rays(self, samples: int, seed: int, block: slice, passes: int = 1, subset: IntArray | None = None) -> Rays:
-        """Start `samples` rays per pixel of a block and pass, or as many more as fit the sampler.
+    def sampled(self, pixels: Pixels, work: Plan, seed: int) -> Rays:
+        """Start rays at the points of Mitsuba's sampler, whose number in a pass has to fit it.
 
         The sampler remains ready for what the rays meet. Every pixel and pass has its own stream of every sampler,
-        since Mitsuba seeds by the first lane of each wavefront. The passes of one pixel are adjacent.
-        subset : pixels that the block selects from; None: all
+        since Mitsuba seeds by the first lane of each wavefront.
         """
-        samples = fitting(self._sampler_name, samples)
-        self.sampler.set_sample_count(samples)
-        self.sampler.set_samples_per_wavefront(samples)
-        lanes = (block.stop - block.start) * passes * samples
+        self.sampler.set_sample_count(work.samples)
+        self.sampler.set_samples_per_wavefront(work.samples)
+        lanes = pixels.count * work.total
         self.sampler.seed(seed, lanes)
         draws = ReseededSampler(self.sampler, seed, lanes)
-        rays = self._started(self._load(block, subset), Plan(passes, samples), self.sampler.next_2d(), draws)
+        rays = self.rays(pixels, work, draws)
         if draws.has_drawn or (self._has_world and self._sampler_name in RELATED_DRAWS):
             draws.reseeded()
         return rays
 
-    def sobol_rays(self, samples: int, seed: int, block: slice, passes: int, subset: IntArray) -> Rays:
-        """Start rays as `rays` does, a power of two per pixel and pass, at Sobol's points of pixel and pupil together.
+    def grid(self, pixels: Pixels, cells: int, margin: float, seeds: Sequence[Seed]) -> GridDraws:
+        """Return points in the cells of a grid over each pixel and pass; seeds : of the passes, by sub-imager."""
+        numbers, own = self._places.numbers(pixels.numbers)
+        keys = np.array([[seed(index) for seed in seeds] for index in range(int(own.max()) + 1)], dtype=np.int64)
+        return GridDraws(cells, margin, keys[own], numbers)
 
-        Mitsuba's sampler is not ready for what the rays meet.
-        """
-        draws = SobolDraws(seed, (block.stop - block.start) * passes * samples, samples)
-        return self._started(self._load(block, subset), Plan(passes, samples), draws.next_2d(), draws)
-
-    def middle_rays(
-        self, samples: int, seed: int, block: slice, passes: int, subset: IntArray
-    ) -> tuple[Rays, tuple[Any, Any]]:
-        """Start rays as `sobol_rays` does, but from the middles of pixels; return the falloff across their pixels, too.
-
-        falloff : relative change of the weight from one edge of a pixel's open part to the other, down and across
-        """
+    def falloff(self, pixels: Pixels, work: Plan) -> tuple[Any, Any]:
+        """Return the relative change of each ray's weight across its pixel's open part, down and across."""
         import drjit as dr
         import mitsuba as mi
 
-        lanes = (block.stop - block.start) * passes * samples
-        self.lens.spreads = True
-        draws, places = SobolDraws(seed, lanes, samples), self._load(block, subset)
-        rays = self._started(places, Plan(passes, samples), mi.Point2f(0.5), draws)
-        self.lens.spreads = False
-        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, passes * samples)
-        x, y, z = (dr.gather(mi.Float, row, index) for row in places[0][:3])
+        index = dr.arange(mi.UInt32, pixels.count * work.total) // dr.opaque(mi.UInt32, work.total)
+        x, y, z = (dr.gather(mi.Float, row, index) for row in self._load(pixels)[0][:3])
         x, y = x + self._pitch / 2, y + self._pitch / 2
         slope = -4 * self._pitch / (x * x + y * y + z * z) if self.lens.has_weights else 0.0  # of cos^4
-        return rays, (self._open[0] * slope * y, self._open[1] * slope * x)
+        return self._open[0] * slope * y, self._open[1] * slope * x
 
-    def middles(self, pixels: IntArray) -> Rays:
-        """Start the ray from the middle of each of some pixels of the group, of pinholes."""
+    def _load(self, pixels: Pixels) -> tuple[list[Any], Any]:
+        """Load the places of pixels: coordinates and axes, and the number of each pixel's lens."""
         import mitsuba as mi
 
-        return self._started(self._load(slice(0, pixels.size), pixels), Plan(1, 1), mi.Point2f(0.5), None)
+        if self._loaded is None or self._loaded[0] is not pixels:
+            numbers = pixels.numbers
+            coordinates = [mi.Float(np.ascontiguousarray(row, dtype=np.float32)) for row in self._places.at(numbers)]
+            self._loaded = pixels, coordinates, mi.UInt32(self._places.numbers(numbers)[1].astype(np.uint32))
+        return self._loaded[1:]
 
-    def grid_rays(self, grid: Grid, passes: int, keys: IntArray, pixels: IntArray) -> Rays:
-        """Start one ray per cell of a grid over each pixel and pass, of pinholes, by random numbers of each pixel.
-
-        The numbers depend on the key of a pixel's sub-imager and pass, and on the pixel's place in the sub-imager.
-        keys : (sub-imagers of the camera, passes) of 32 bits;  pixels : of the group. The passes of one are adjacent.
-        """
+    def rays(self, pixels: Pixels, work: Plan, draws: Any) -> Rays:
+        """Start the rays of some pixels; the passes of one pixel, and the samples of one pass, are adjacent."""
         import drjit as dr
         import mitsuba as mi
 
-        work = Plan(passes, grid.cells**2)
-        lane = dr.arange(mi.UInt32, pixels.size * work.total)
-        of_pass = lane // dr.opaque(mi.UInt32, work.samples)
-        numbers, own = self._places.numbers(pixels)
-        key = mi.UInt32(keys[own].astype(np.uint32).ravel())
-        number = dr.gather(mi.UInt32, mi.UInt32(numbers.astype(np.uint32)), of_pass // dr.opaque(mi.UInt32, passes))
-        at = grid.position(lane, dr.gather(mi.UInt32, key, of_pass), number)
-        return self._started(self._load(slice(0, pixels.size), pixels), work, at, None)
-
-    def _load(self, block: slice, subset: IntArray | None) -> tuple[list[Any], Any]:
-        """Load the places of the pixels of a block: coordinates and axes, and the number of each pixel's lens."""
-        import mitsuba as mi
-
-        if subset is None and self._loaded is not None and self._loaded[0] == block:
-            return self._loaded[1:]
-        pixels = np.arange(block.start, block.stop) if subset is None else subset[block]
-        coordinates = [mi.Float(np.ascontiguousarray(row, dtype=np.float32)) for row in self._places.at(pixels)]
-        own = mi.UInt32(self._places.numbers(pixels)[1].astype(np.uint32))
-        if subset is None:
-            self._loaded = block, coordinates, own
-        return coordinates, own
-
-    def _started(self, places: tuple[list[Any], Any], work: Plan, at: Any, draws: Any) -> Rays:
-        """Return the rays of some pixels.
-
-        places : of these, as of `_load`
-        at : points of the open parts, in [0, 1)^2;  draws : of the other random numbers
-        """
-        import drjit as dr
-        import mitsuba as mi
-
-        coordinates, own = places
-        lanes = dr.width(own) * work.total
+        coordinates, own = self._load(pixels)
+        lanes = pixels.count * work.total
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, work.total)
         corner_x, corner_y, corner_z, lens_x, lens_y, *axes = (dr.gather(mi.Float, row, index) for row in coordinates)
-        down, across = self._open
+        (down, across), at = self._open, draws.position()
         at = mi.Point2f((1 - across) / 2 + across * at.x, (1 - down) / 2 + down * at.y) * self._pitch
         if self._blur is not None:
             at += self._blur * mi.warp.square_to_std_normal(draws.next_2d())
+        self.lens.spreads = draws.spreads
         if axes:
             x = corner_x + axes[0] * at.x + axes[1] * at.y
             y = corner_y + axes[2] * at.x + axes[3] * at.y

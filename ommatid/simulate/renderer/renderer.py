@@ -9,10 +9,10 @@ and can round up to the next one's.) Around the target, or instead of it, there 
 # pyright: basic
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from math import isqrt
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -25,22 +25,25 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.estimation import Sampler
 
-from ..sampling.passes import AVERAGED, Plan, has_equal_boxes, margin
+from ..sampling.passes import Plan, has_equal_boxes, margin
 from ..sampling.samplers import fitting
 from .averages import Averages
-from .draws import Grid
+from .draws import SobolDraws
 from .plugins import black, depths, scene_of, stock_sensors, target_of
+from .rays import Pixels, RayGenerator, Rays, Seed
 from .variant import activate, check_fast_variant, ignored_samples
 from .worlds.placement import MILLIMETRES_AT_ORIGIN
 
 if TYPE_CHECKING:
-    from .rays import RayGenerator, Rays
     from .world import StagedWorld
 
 TYPICAL = 0.5  # of the most by which float32 may move a point
 EXACT_SUMS = 2**22, 2**50  # float32 sums of whole numbers below, and float64 ones, lose less than 1/4
 MOST_TEXELS = 2**24  # that float32 can number
 FAR = 1e4  # in distances of the target: how far stock sensors see into a world
+# Where rays start: at the points of Mitsuba's sampler; at Sobol's of pixel and pupil, or of the pupil alone where the
+# picture is averaged over each pixel exactly; and by `exact_plan` in the cells of a grid, or by averages alone.
+Points = Literal["sampler", "sobol", "grid", "averages"]
 
 
 class Renderer:
@@ -81,8 +84,6 @@ class Renderer:
         self.exact_below = EXACT_SUMS[fast]
         self._generators: dict[str, RayGenerator] = {}
         if fast:
-            from .rays import RayGenerator
-
             for group, types in self.groups.items():
                 self._generators[group] = RayGenerator(camera, types, sampler, world is not None)
         self._unit = 1.0  # radiance of a value of 1
@@ -100,10 +101,7 @@ class Renderer:
         else:
             self._build_world(world, variant)
         far = 2.0 if world is None else FAR
-        self._sensors: dict[str, dict[int, Any]] = {
-            group: stock_sensors(camera, types, sampler, self.channels, far, self._placement)
-            for group, types in ({} if fast else self.groups).items()
-        }
+        self._sensors = [] if fast else stock_sensors(camera, sampler, self.channels, far, self._placement)
         self._parameters = mi.traverse(self._scene)
 
     @property
@@ -131,122 +129,93 @@ class Renderer:
         self._parameters[self._texels] = mi.TensorXf(texels)
         self._parameters.update()
 
-    def expose(
-        self,
-        group: str,
-        samples: int,
-        seed: Callable[[int], int],
-        subset: IntArray | None = None,
-        block: slice | None = None,
-    ) -> FloatArray:
-        """Return the readings of a group's pixels for each picture, (channels, pixels in the order of measurements).
+    def pixels(self, group: str, subset: IntArray | None = None) -> Pixels:
+        """Return the pixels of a group, or a subset of them."""
+        rows = self.rows(group)
+        count = rows.stop - rows.start if subset is None else subset.size
+        return Pixels(group, slice(0, count), subset, list(self.groups).index(group))
+
+    def sub_imagers(self, indices: Sequence[int], subset: IntArray | None = None) -> Pixels:
+        """Return the pixels of adjacent sub-imagers of one lens type, or a subset of those of one."""
+        lens_type, slices = self.camera.sub_imagers[indices[0]].type, self.camera.slices()
+        group = next(name for name, types in self.groups.items() if lens_type in types)
+        start = self.rows(group).start
+        first, stop = slices[indices[0]].start - start, slices[indices[-1]].stop - start
+        if subset is None:
+            return Pixels(group, slice(first, stop), None, indices[0])
+        return Pixels(group, slice(0, subset.size), first + subset, indices[0])
+
+    def blocks(self, pixels: Pixels, samples: int) -> list[Pixels]:
+        """Divide pixels into blocks whose rays, `samples` a pixel, start together: one on scalar."""
+        return pixels.blocks(samples) if self.is_fast else [pixels]
+
+    def expose(self, pixels: Pixels, samples: int, seeds: Sequence[Seed], points: Points = "sampler") -> FloatArray:
+        """Return the readings of pixels for each picture and pass: (channels, passes, pixels).
 
         An infinite uniform target reads its own value: the light of a pixel's rays is divided by their weights. Pixels
         that no light can reach read NaN.
-        samples : rays per pixel
-        seed : the sampler's seed by the index of a sensor: of the group on the fast backends, else of the sub-imager
-        subset : pixels of the group; None: all of them
-        block : one of `blocks`, on the fast backends; else, and if absent, all of them
+        samples : rays per pixel in a pass;  points : at which they start, on the fast backends
+        seeds : the sampler's of each pass, by the index of a sensor. On the fast backends, where the passes start
+            together, the first counts for `pixels.sensor`; on scalar, and of a grid, each counts for every sub-imager,
+            whose values then depend on no other one.
         """
         ignored_samples()  # those of an earlier scene are not this one's
-        if self._generators:
-            blocks = self.blocks(group, samples, subset) if block is None else [block]
-            rays = (self._rays(group, samples, seed, block, subset) for block in blocks)
-            return np.concatenate([self._readings(group, block) for block in rays])[None]
-        images = [self._film(sensor, samples, seed(index)) for index, sensor in self._sensors[group].items()]
-        films = np.concatenate(images, axis=1) / self._unit
-        return films if subset is None else films[:, subset]
+        if not self.is_fast:
+            return self._films(pixels, samples, seeds)
+        samples = fitting(self._sampler, samples) if points == "sampler" else samples
+        rays = 1 if points == "averages" else samples * len(seeds)
+        parts = [self._passes(block, Plan(len(seeds), samples), seeds, points) for block in pixels.blocks(rays)]
+        return np.concatenate(parts, axis=1)[None]
 
-    def _film(self, sensor: Any, samples: int, seed: int) -> FloatArray:
-        """Return the radiances that a stock sensor records, (channels, pixels)."""
+    def _films(self, pixels: Pixels, samples: int, seeds: Sequence[Seed]) -> FloatArray:
+        """Render the sub-imagers of pixels by stock sensors: (channels, passes, pixels)."""
         import mitsuba as mi
 
-        choices: Any = {"sensor": sensor, "integrator": self._integrator, "spp": samples, "seed": seed}
-        rendered: Any = mi.render(self._scene, **choices)
-        return self._sound(np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1))
+        rows = pixels.numbers + self.rows(pixels.group).start
+        parts: list[FloatArray] = []
+        for index, own in enumerate(self.camera.slices()):
+            first, stop = np.searchsorted(rows, (own.start, own.stop))
+            films: list[FloatArray] = []
+            for seed in seeds if stop > first else ():
+                choices: Any = {"sensor": self._sensors[index], "integrator": self._integrator, "seed": seed(index)}
+                rendered: Any = mi.render(self._scene, **choices, spp=samples)
+                film = np.moveaxis(np.array(rendered, dtype=np.float64), -1, 0).reshape(self.channels, -1)
+                films.append(self._sound(film)[:, rows[first:stop] - own.start])
+            parts += [np.stack(films, axis=1)] if films else []
+        return np.concatenate(parts, axis=2) / self._unit
 
-    def expose_alone(
-        self, index: int, pixels: IntArray, work: Plan, seed: Callable[[int], int], sobol: bool = False
-    ) -> FloatArray:
-        """Return the readings of some pixels of one sub-imager in each of several passes, (passes, pixels).
-
-        index : of the sub-imager in the camera;  pixels : of it; on the scalar backend the others cost as much
-        seed : the sampler's seed by the number of a pass. Seeds differ between sub-imagers, so that the values do not
-            depend on which others are rendered; on the fast backends, where the passes start together, the first counts
-        sobol : True takes Sobol's points of the pupil, and exact averages over the pixel or Sobol's points of it, too;
-            on the fast backends, without a world
-        """
-        sub, rows = self.camera.sub_imagers[index], self.camera.slices()[index]
-        group = next(name for name, types in self.groups.items() if sub.type in types)
-        if not self._generators:
-            sensor = self._sensors[group][index]
-            films = [self._film(sensor, work.samples, seed(number))[0, pixels] for number in range(work.passes)]
-            return np.stack(films) / self._unit
-        generator, subset = self._generators[group], pixels + (rows.start - self.rows(group).start)
-        parts, start = list[FloatArray](), generator.sobol_rays if sobol else generator.rays
-        averages = self._averages_of(sub.type) if sobol else None
-        for block in generator.blocks(work.total, pixels.size):
-            arguments = work.samples, block_seed(seed(0), block.start), block, work.passes, subset
-            if averages is not None:
-                rays, falloff = generator.middle_rays(*arguments)
-                readings = self._weighed(group, rays, averages.light(rays.ray, falloff))
-            else:
-                readings = self._readings(group, start(*arguments))
-            parts.append(readings.reshape(-1, work.passes).T)
-        return np.concatenate(parts, axis=1)
-
-    def expose_exactly(
-        self, indices: Sequence[int], work: Plan, seeds: Sequence[Callable[[int], int]]
-    ) -> Iterator[tuple[slice, FloatArray]]:
-        """Yield the readings of adjacent sub-imagers of pinholes without error: measurements, and (passes, pixels).
-
-        work : from `exact_plan`, by averages of the picture, or by grids in whose cells samples keep a margin to the
-            edges. Of the four averages each is displaced along an axis by what float32 may round.
-        seeds : of each pass, by the index of a sub-imager. The values of a sub-imager depend on no other one: on the
-            fast backends all start together, on scalar they are rendered one by one.
-        """
-        sub, slices = self.camera.sub_imagers[indices[0]], self.camera.slices()
-        if not self._generators:
-            for index in indices:
-                pixels = np.arange(slices[index].stop - slices[index].start)
-                values = self.expose_alone(index, pixels, work, lambda number, index=index: seeds[number](index))
-                yield slices[index], values
-            return
-        group = next(name for name, types in self.groups.items() if sub.type in types)
-        generator, away = self._generators[group], margin(self.camera, sub.type)
-        first, stop, start = slices[indices[0]].start, slices[indices[-1]].stop, self.rows(group).start
-        averages = self._averages_of(sub.type) if work == AVERAGED else None
-        keys = np.array([[seed(index) for seed in seeds] for index in range(len(slices))], dtype=np.int64)
-        for block in generator.blocks(work.total if averages is None else 1, stop - first):
-            part = slice(first + block.start, first + block.stop)
-            pixels = np.arange(part.start - start, part.stop - start)
-            if averages is None:
-                rays = generator.grid_rays(Grid(isqrt(work.samples), away), work.passes, keys, pixels)
-                yield part, self._readings(group, rays).reshape(-1, work.passes).T
-                continue
-            rays, by = generator.middles(pixels), TYPICAL * away
+    def _passes(self, pixels: Pixels, work: Plan, seeds: Sequence[Seed], points: Points) -> FloatArray:
+        """Return the readings of pixels whose rays start together: (passes, pixels)."""
+        generator, seed = self._generators[pixels.group], block_seed(seeds[0](pixels.sensor), pixels.block.start)
+        lens_type = self.camera.sub_imagers[pixels.sensor].type
+        away, light = margin(self.camera, lens_type), None
+        averages = self._averages_of(lens_type) if points in ("sobol", "averages") else None
+        if averages is not None and points == "averages":
+            by, draws = TYPICAL * away, SobolDraws(seed, pixels.count, 1, middle=True)  # a pinhole draws nothing
+            rays = generator.rays(pixels, Plan(1, 1), draws)
             met = (averages.light(rays.ray, moved=moved) for moved in ((by, 0), (-by, 0), (0, by), (0, -by)))
-            yield part, np.stack([self._weighed(group, rays, light) for light in met])
-
-    def blocks(self, group: str, samples: int, subset: IntArray | None = None) -> list[slice]:
-        """Divide the pixels of a group into blocks whose rays start together. Only on the fast backends."""
-        pixels = None if subset is None else subset.size
-        return self._generators[group].blocks(fitting(self._sampler, samples), pixels)
-
-    def _rays(
-        self, group: str, samples: int, seed: Callable[[int], int], block: slice, subset: IntArray | None
-    ) -> Rays:
-        first = seed(list(self.groups).index(group))
-        return self._generators[group].rays(samples, block_seed(first, block.start), block, subset=subset)
-
-    def _readings(self, group: str, rays: Rays) -> FloatArray:
-        """Return the readings of the pixels of these rays: (pixels of the block,)."""
-        sampler = self._generators[group].sampler
-        if self._texture is None:
-            light = self._integrator.sample(self._scene, sampler, rays.ray, None, True)[0].x
+            return np.stack([self._weighed(pixels.group, rays, light) for light in met])
+        if points == "sampler":
+            rays = generator.sampled(pixels, work, seed)
+        elif points == "grid":
+            rays = generator.rays(pixels, work, generator.grid(pixels, isqrt(work.samples), away, seeds))
         else:
-            light = self._radiance(rays.ray)
-        return self._weighed(group, rays, light)
+            draws = SobolDraws(seed, pixels.count * work.total, work.samples, middle=averages is not None)
+            rays = generator.rays(pixels, work, draws)
+            light = None if averages is None else averages.light(rays.ray, generator.falloff(pixels, work))
+        light = self._light(pixels.group, rays) if light is None else light
+        return self._weighed(pixels.group, rays, light).reshape(-1, work.passes).T
+
+    def _light(self, group: str, rays: Rays) -> Any:
+        """Return the radiance that each ray meets."""
+        import mitsuba as mi
+
+        if self._texture is None:
+            return self._integrator.sample(self._scene, self._generators[group].sampler, rays.ray, None, True)[0].x
+        # What the integrator yields, in a third of the time.
+        met = self._scene.ray_intersect_preliminary(rays.ray, coherent=True)
+        at = met.compute_surface_interaction(rays.ray, int(mi.RayFlags.UV))
+        return self._texture.eval_1(at, at.is_valid())
 
     def _weighed(self, group: str, rays: Rays, light: Any) -> FloatArray:
         """Return the readings of the pixels of these rays from the light that each meets: (pixels of the block,)."""
@@ -265,24 +234,14 @@ class Renderer:
             self._averages[lens_type.name] = Averages(self.camera, lens_type, self._picture * self._unit)
         return self._averages[lens_type.name]
 
-    def _radiance(self, ray: Any) -> Any:
-        """Return the target's radiance where rays meet it: what the integrator yields, in a third of the time."""
-        import mitsuba as mi
-
-        met = self._scene.ray_intersect_preliminary(ray, coherent=True)
-        at = met.compute_surface_interaction(ray, int(mi.RayFlags.UV))
-        return self._texture.eval_1(at, at.is_valid())
-
     def depths(self, pinhole: Camera, seed: int) -> FloatArray:
         """Return the distance along z of what a pinhole camera's only sub-imager sees; see `plugins.depths`."""
         return depths(self._scene, pinhole, seed, FAR, self._placement)
 
-    def hits(
-        self, group: str, samples: int, seed: Callable[[int], int], block: slice, subset: IntArray | None = None
-    ) -> tuple[IntArray, FloatArray | None]:
-        """Return the pixel of f that each ray of a block meets, (pixels, samples), -1 off the target; and weights.
+    def hits(self, pixels: Pixels, samples: int, seed: Seed) -> tuple[IntArray, FloatArray | None]:
+        """Return the pixel of f that each ray of some pixels meets, (pixels, samples), -1 off the target; and weights.
 
-        The rays are those of `expose` with the same samples and seed. Only on the fast backends.
+        The rays are those of `expose` with the same samples and seed; all start together. Only on the fast backends.
         """
         import drjit as dr
 
@@ -291,7 +250,9 @@ class Renderer:
                 f"expected a target of fewer than 2^24 pixels, got {self.camera.unknowns}; make it smaller"
             )
         self.set_target(np.arange(1.0, self.camera.unknowns + 1).reshape(self.camera.shape))
-        rays = self._rays(group, samples, seed, block, subset)
+        work = Plan(1, fitting(self._sampler, samples))
+        first = block_seed(seed(pixels.sensor), pixels.block.start)
+        rays = self._generators[pixels.group].sampled(pixels, work, first)
         met = self._scene.ray_intersect(rays.ray)
         radiance = met.emitter(self._scene).eval(met, met.is_valid()).x
         dr.eval(radiance, rays.weight)

@@ -109,6 +109,14 @@ class Tally:
         self._mean = np.zeros(shape)
         self._squares = np.zeros(shape)
 
+    @staticmethod
+    def of(passes: FloatArray) -> Tally:
+        """Return the tally of passes: (passes, ...)."""
+        tally = Tally(*passes.shape[1:])
+        for values in passes:
+            tally.add(values)
+        return tally
+
     def state(self, name: str) -> State:
         """Return the arrays of a checkpoint, under keys that begin with `name`."""
         return {f"{name}.count": np.array(self.count), f"{name}.mean": self._mean, f"{name}.squares": self._squares}

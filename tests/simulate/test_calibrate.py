@@ -19,6 +19,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.simulate import calibrate
 from ommatid.simulate.calibration import entries, point_sources
 from ommatid.simulate.calibration.point_sources import VisiblePixels, of_pinholes
+from ommatid.simulate.calibration.responses import measured
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
 from ..examples import scene
@@ -53,13 +54,13 @@ def test_a_source_assigned_to_the_wrong_pixel_is_detected(monkeypatch: pytest.Mo
     camera = derive(described)
     right = point_sources.visible_pixels
 
-    def wrong(renderer: Any, group: str, subset: Any) -> VisiblePixels:
-        visible = right(renderer, group, subset)
+    def wrong(renderer: Any, pixels: Any) -> VisiblePixels:
+        visible = right(renderer, pixels)
         return replace(visible, row=visible.row + 3, column=visible.column + 3)
 
     monkeypatch.setattr(point_sources, "visible_pixels", wrong)
     with pytest.raises(MachineError, match="uniform"):
-        point_sources.responses_from_points(Setup(described, camera))
+        measured(Setup(described, camera), by_points=True)
 
 
 def test_the_stated_uncertainty_of_h_is_its_real_error() -> None:

@@ -19,7 +19,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.calibration.fit.chart import SIDE, chart_of
 from ommatid.simulate.calibration.fit.fit import FittedCalibration, calibrate_by_fit
-from ommatid.simulate.calibration.point_sources import Responses, Subsets
+from ommatid.simulate.calibration.responses import Responses, Subsets
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.sampling.passes import BATCHES, FEWEST_PASSES
 

@@ -14,7 +14,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces
 from ommatid.scenes.tables.camera import ToleranceTable
-from ommatid.simulate.calibration.point_sources import Responses
+from ommatid.simulate.calibration.responses import Responses
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.kernel_fit.kernel_fit import KernelFit, fit_kernels, refusal
 from tests.examples import with_optics

@@ -16,7 +16,8 @@ from scipy import sparse, stats
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.optics.blur import blur_of
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.calibration.ray_transport import one_pass, responses_from_rays
+from ommatid.simulate.calibration.ray_transport import one_pass
+from ommatid.simulate.calibration.responses import measured
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import choose
@@ -60,7 +61,7 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     needs("llvm_ad_mono")
     render = {"sampler": "independent", "complete": True}
     described, camera = with_optics(*CLOSED[kind], calibration={"samples": SAMPLES}, render=render)
-    traced = responses_from_rays(Setup(described, camera))
+    traced = measured(Setup(described, camera), by_points=False)
     found = scores(traced.matrix, true_matrix(camera), traced.passes * traced.samples)
     assert found.size > 5000
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
@@ -76,7 +77,7 @@ def test_traced_h_of_several_wavelengths_is_the_closed_form() -> None:
     tables: dict[str, Any] = {"calibration": {"samples": SAMPLES}, "render": render, "light": {"spectrum": "LED-B3"}}
     described, camera = with_optics(lens, {}, **tables)
     assert len(camera.wavelengths) > 2
-    traced = responses_from_rays(Setup(described, camera))
+    traced = measured(Setup(described, camera), by_points=False)
     found = scores(traced.matrix, ideal_matrix(camera), SAMPLES)
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)

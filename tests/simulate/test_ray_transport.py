@@ -9,8 +9,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.calibration.point_sources import responses_from_points
-from ommatid.simulate.calibration.ray_transport import one_pass, responses_from_rays
+from ommatid.simulate.calibration.ray_transport import one_pass
+from ommatid.simulate.calibration.responses import measured
 from ommatid.simulate.render import light
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.sampling.passes import Plan
@@ -25,7 +25,7 @@ def test_h_is_that_of_point_sources() -> None:
     needs("llvm_ad_mono")
     tables = {"calibration": {"samples": 32}, "render": {"complete": True, "variant": "llvm_ad_mono"}}
     setup = Setup(*with_optics({}, {}, SMALL, (7, 7), **tables))
-    by_rays, by_points = responses_from_rays(setup), responses_from_points(setup)
+    by_rays, by_points = measured(setup, by_points=False), measured(setup, by_points=True)
     assert abs(by_rays.matrix - by_points.matrix).max() < 1e-6 * by_points.matrix.max()
     np.testing.assert_allclose(by_rays.variance, by_points.variance, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(by_rays.batches, by_points.batches, atol=1e-7)
@@ -88,6 +88,6 @@ def test_pixels_in_blocks_give_the_same_picture_with_other_noise(monkeypatch: py
     assert (pieces.mean[4:] != whole.mean[4:]).any()
     assert (light(setup).mean == pieces.mean).all(), "repeatable"
     monkeypatch.setattr(rays, "MOST_RAYS", 4 * 4)
-    by_rays, by_points = responses_from_rays(setup), responses_from_points(setup)
+    by_rays, by_points = measured(setup, by_points=False), measured(setup, by_points=True)
     assert abs(by_rays.matrix - by_points.matrix).max() < 1e-12
     np.testing.assert_allclose(by_rays.variance, by_points.variance, rtol=1e-9, atol=1e-15)

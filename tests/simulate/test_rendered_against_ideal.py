@@ -19,7 +19,7 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import Sampler
-from ommatid.simulate.calibration.point_sources import responses_from_points
+from ommatid.simulate.calibration.responses import measured
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import Rendering, light
 from ommatid.simulate.sampling.passes import rounding_variance
@@ -74,7 +74,7 @@ def test_sub_images_of_a_photograph(variant: str, sampler: Sampler) -> None:
 def test_calibrated_h(variant: str, samples: int) -> None:
     needs(variant)
     setup = three_types(variant, samples)
-    responses = responses_from_points(setup)
+    responses = measured(setup, by_points=True)
     matrix, exact = responses.matrix, ideal_matrix(setup.camera).toarray()
     dense = matrix.toarray()
     assert (dense[exact > 0] > 0).all(), "every entry of the closed form is seen"
@@ -92,7 +92,7 @@ def test_calibrated_h_of_fractional_ratios(variant: str) -> None:
     data = scene((13, 14), lenses, render={"variant": variant, "seed": 2}, calibration={"samples": 4096}).plain()
     data["camera"]["lens"][0]["step"] = "1/3"
     setup = Setup.from_scene(parse(data, Path("test.toml")))
-    responses = responses_from_points(setup)
+    responses = measured(setup, by_points=True)
     matrix, exact = responses.matrix, ideal_matrix(setup.camera).toarray()
     rows = np.repeat(np.arange(setup.camera.measurements), np.diff(matrix.indptr))
     # Slivers that less than one ray in a hundred passes hits are not normally distributed.
@@ -180,8 +180,9 @@ def test_errors_of_data_calibration_and_seeds_are_uncorrelated(variant: str) -> 
     needs(variant)
     setup, other = three_types(variant, 64), three_types(variant, 64, seed=12)
     exact = ideal(setup)[CUT]
-    measured = (light(setup).mean, light(other).mean, responses_from_points(setup).matrix @ setup.image.ravel())
-    errors = np.array([(values[CUT] - exact) / np.sqrt(exact + 1) for values in measured])
+    calibrated = measured(setup, by_points=True).matrix @ setup.image.ravel()
+    every = light(setup).mean, light(other).mean, calibrated
+    errors = np.array([(values[CUT] - exact) / np.sqrt(exact + 1) for values in every])
     correlations = np.corrcoef(errors)[np.triu_indices(3, 1)]
     assert np.abs(correlations).max() < stats.norm.isf(familywise(6) / 2) / exact.size**0.5
 

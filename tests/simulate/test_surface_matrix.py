@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse, stats
 
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.calibration.ray_transport import responses_from_rays
+from ommatid.simulate.calibration.responses import measured
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.lenses.field import TOLERANCE, field_of
 from ommatid.simulate.lenses.point_spread import density, grid_of, point_spread
@@ -64,7 +64,7 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     needs("llvm_ad_mono")
     surfaces, wavelength, more = CASES[kind]
     setup = setup_of(surfaces, wavelength, **more)
-    traced = responses_from_rays(setup)
+    traced = measured(setup, by_points=False)
     lens = field_of(setup.camera, setup.camera.types[0], None)
     # Rays alone leave through the whole exit disk; those that the lens blocks do not count.
     lit = float(lens.lit_share(np.zeros(1))[0]) if wavelength == "none" else 1.0

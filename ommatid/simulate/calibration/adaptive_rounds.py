@@ -22,10 +22,9 @@ from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint
-from ..sampling.passes import FEWEST_PASSES, MOST_SAMPLES, Plan, cells_of, on_grid
+from ..sampling.passes import FEWEST_PASSES, MOST_SAMPLES, Plan, Plans, cells_of, on_grid
 from ..sampling.sample_law import SampleLaw
 from .entries import rendered_model
-from .point_sources import Plans
 
 GOAL = 0.1  # of all the rest of the expected error: what the uncertainty of H may add
 DONE, AIM = 0.025, 0.0125  # addition at which a round is accepted, and the one it is planned for

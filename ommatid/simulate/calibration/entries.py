@@ -21,10 +21,10 @@ from ommatid.scenes.shrinkage import shrink_variances
 
 from ..ideal import ideal_matrix
 from ..sampling.checkpoint import Checkpoint
-from ..sampling.passes import rounding_variance
+from ..sampling.passes import Plans, rounding_variance
 from ..validation import check_entries
 from .fit.chart import SIDE
-from .point_sources import Plans, Responses, Subsets, responses_from_points, same_plans
+from .responses import Responses, Subsets, measured, same_plans
 
 
 def rendered_model(
@@ -45,29 +45,26 @@ def rendered_model(
         if setup.is_applied:  # then no memory was asked for entries
             whole = [lens for lens in camera.types if subsets is None or _is_whole(subsets, lens)]
             check_entries(setup, whole, "few numbers do not explain all of H: ")
-        if setup.renders_points:
-            responses = responses_from_points(setup, progress, checkpoint, plans, subsets)
-        else:
-            from .ray_transport import responses_from_rays
+        by_points = setup.renders_points
+        return measured(
+            setup, by_points=by_points, progress=progress, checkpoint=checkpoint, plans=plans, subsets=subsets
+        )
 
-            responses = responses_from_rays(setup, progress, plans, subsets)
-        return replace(responses, float32_samples=1) if float64 else responses
+    def variances(responses: Responses) -> FloatArray:
+        return entry_variances(responses, camera, 1 if float64 else responses.samples)
 
     if fits(setup):
         from .fit.fit import calibrate_by_fit
 
         rays = {name: work.total for name, work in (plans or same_plans(setup)).items()}
         views_alone = scene.calibration.fit == "geometry"
-        fit = calibrate_by_fit(
-            setup.simulated, measure, lambda each: entry_variances(each, camera), rays, with_kernels=not views_alone
-        )
+        fit = calibrate_by_fit(setup.simulated, measure, variances, rays, with_kernels=not views_alone)
         record |= {"fit": fit.record, **fit.responses.record()}
         rest = None if fit.rest is None else _received(camera, fit.rest)
         model = fitted_model(setup.resolved, camera, fit.matrix, rest, record)
     else:
         responses = measure(None)
-        measured = MeasuredRows(responses.matrix, entry_variances(responses, camera), responses.batches)
-        rows = _received(camera, measured)
+        rows = _received(camera, MeasuredRows(responses.matrix, variances(responses), responses.batches))
         record |= responses.record()
         model = Model(setup.resolved, camera, rows.matrix, rows.variance, rows.batches, record)
     seconds = perf_counter() - start
@@ -120,14 +117,16 @@ def _compared(model: Model, camera: Camera, passes: int) -> dict[str, Any]:
     return {"agreement": {"rms_difference_from_ideal": rms, **compared}}
 
 
-def entry_variances(responses: Responses, camera: Camera) -> FloatArray:
-    """Return the variances of H's entries, shrunk towards their sub-imager's mean and never below rounding."""
+def entry_variances(responses: Responses, camera: Camera, summed: int) -> FloatArray:
+    """Return the variances of H's entries, shrunk towards their sub-imager's mean and never below rounding.
+
+    summed : samples that are summed in float32
+    """
     starts = responses.matrix.indptr
     shrunk = np.empty_like(responses.variance)
     for rows in camera.slices():
         stored = slice(int(starts[rows.start]), int(starts[rows.stop]))
         shrunk[stored] = shrink_variances(responses.variance[stored], responses.passes)
-    summed = responses.samples if responses.float32_samples is None else responses.float32_samples
     return np.maximum(shrunk, rounding_variance(responses.matrix.data, summed))
 
 

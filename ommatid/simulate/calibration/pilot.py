@@ -26,13 +26,13 @@ from ommatid.scenes.shrinkage import shrink_variances
 
 from ..render import light
 from ..renderer.variant import choose, unusable_reason
-from ..sampling.passes import BATCHES, Plan, plan
+from ..sampling.passes import BATCHES, Plan, Plans, plan
 from ..sampling.sample_law import SampleLaw
 from ..sampling.samplers import fitting
 from .adaptive_rounds import LEAST, plans_of
 from .entries import rendered_model
-from .point_sources import Plans, same_plans
 from .ray_transport import positions_of
+from .responses import same_plans
 
 MOST_RAYS = 2**26  # of a pilot: some seconds
 FEWEST_SAMPLES = 16  # per pixel in a pass

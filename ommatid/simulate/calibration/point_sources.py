@@ -17,19 +17,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import sparse
 
-from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import MachineError
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.setup import Setup
+from ommatid.scenes.model import MeasuredRows
 
-from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint, State
-from ..sampling.passes import BATCHES, OverPasses, Plan, Tally, plan
+from ..sampling.passes import BATCHES, Plan, Plans, Tally
 
 if TYPE_CHECKING:
+    from ..renderer.rays import Pixels
     from ..renderer.renderer import Renderer
 
 ROW_TOLERANCE = 1e-4  # float32 sums of up to 4096 samples are wrong by 4e-5
@@ -37,26 +37,7 @@ RENDERINGS = 8.0  # approximate time of a calibration, in renderings of one pict
 STRAYS = 2  # rays of a sensor pixel that float32 may have rounded over the edge of the target
 
 
-# Rows of H of one group, the variances of their entries, (nnz,), and their batches, (batches, nnz).
-Part = tuple[sparse.csr_array, FloatArray, Float32Array]
-Plans = dict[str, Plan]  # by the name of a group
-Subsets = dict[str, IntArray | None]  # pixels of a group, None: all, by its name
 MARGIN = Fraction(1, 1024)  # pixels of f by which rays may land beside a footprint: far more than they are rounded
-
-
-@dataclass(frozen=True)
-class Responses(OverPasses):
-    """Measured entries of H, before they become a model.
-
-    matrix : means of the entries;  variance : (nnz,) of these means, from the scatter of the passes
-    batches : (batches, nnz) deviations of the means of some passes from those of all
-    samples : the most, where the groups differ;  float32_samples : of them, those summed in float32; None: all
-    """
-
-    matrix: sparse.csr_array
-    variance: FloatArray
-    batches: Float32Array
-    float32_samples: int | None = None
 
 
 def grid(camera: Camera, spacing: int, row: int, column: int) -> FloatArray:
@@ -66,87 +47,31 @@ def grid(camera: Camera, spacing: int, row: int, column: int) -> FloatArray:
     return image
 
 
-def responses_from_points(
-    setup: Setup,
+def rows_from_points(
+    renderer: Renderer,
+    every: list[Pixels],
+    plans: Plans,
+    seed: int,
     progress: Progress = no_progress,
     checkpoint: Checkpoint | None = None,
-    plans: Plans | None = None,
-    subsets: Subsets | None = None,
-) -> Responses:
-    """Measure H of ideal pinholes by sweeping grids of point sources over the target.
+) -> list[MeasuredRows]:
+    """Measure the rows of H of the pixels of some groups of ideal pinholes by sweeping grids of point sources."""
+    sweeps = [SourceSweep(renderer, pixels) for pixels in every]
+    shares = [sweep.visible.spacing**2 for sweep in sweeps]
+    finished, state = State(), State() if checkpoint is None else checkpoint.state()
+    for number, (sweep, pixels) in enumerate(zip(sweeps, every, strict=True)):
+        work, done, share = plans[pixels.group], sum(shares[:number]), shares[number]
 
-    plans : of each group; None: all as the scene says
-    subsets : groups, and their pixels, that are measured; rows of H of all others are empty; None: all
-    """
-    from ..renderer.renderer import Renderer
-
-    scene, camera, variant = setup.scene, setup.simulated, choose(setup.scene.render.variant)
-    renderer = Renderer(camera, variant, scene.render.sampler, together=False)  # each type has its own spacing
-    plans = same_plans(setup) if plans is None else plans
-    chosen: Subsets = dict.fromkeys(renderer.groups) if subsets is None else subsets
-    sweeps = {group: SourceSweep(renderer, group, chosen[group]) for group in renderer.groups if group in chosen}
-    shares = {group: sweep.visible.spacing**2 for group, sweep in sweeps.items()}
-    parts: dict[str, list[Part]] = {group: [] for group in renderer.groups}
-    done, finished = 0, State()
-    state = State() if checkpoint is None else checkpoint.state()
-    for group, sweep in sweeps.items():
-        begun, work = done, plans[group]
-
-        def report(fraction: float, begun: int = begun, share: int = shares[group]) -> None:
-            progress((begun + fraction * share) / sum(shares.values()))
+        def report(fraction: float, done: int = done, share: int = share) -> None:
+            progress((done + fraction * share) / sum(shares))
 
         sweep.resume(state)
         while sweep.tally.count < work.passes:
-            sweep.add_pass(work, scene.render.seed, report)
+            sweep.add_pass(work, seed, report)
             if checkpoint is not None:
                 checkpoint.offer(lambda sweep=sweep, finished=finished: {**finished, **sweep.state()})
         finished = {**finished, **sweep.state()} if checkpoint is not None else finished
-        parts[group].append(sweep.part(work))
-        done += shares[group]
-    return joined_parts(renderer, parts, chosen, plans, variant, scene.render.seed)
-
-
-def same_plans(setup: Setup) -> Plans:
-    """Return the samples that the scene asks for, the same for all lens types."""
-    work = plan(setup.scene.calibration.sample_count, setup.scene.render.sampler)
-    return {lens_type.name: work for lens_type in setup.camera.types}
-
-
-def on_all_rows(parts: list[Part], rows: slice, subset: IntArray | None, unknowns: int) -> Part:
-    """Return the rows of H of a group from parts of them, those that were not measured empty.
-
-    rows : of the group in H;  subset : pixels of the group that the parts have, one after the other; None: all
-    """
-    size = rows.stop - rows.start
-    if not parts:
-        return sparse.csr_array((size, unknowns)), np.zeros(0), np.zeros((BATCHES, 0), dtype=np.float32)
-    matrices, variances, batches = zip(*parts, strict=True)
-    matrix = sparse.csr_array(sparse.vstack(matrices, format="csr"))
-    if subset is not None:
-        counts = np.zeros(size, dtype=np.int64)
-        counts[subset] = np.diff(matrix.indptr)
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        matrix = sparse.csr_array((matrix.data, matrix.indices, starts), shape=(size, unknowns))
-    return matrix, np.concatenate(variances), np.concatenate(batches, axis=1)
-
-
-def joined_parts(
-    renderer: Renderer, parts: dict[str, list[Part]], subsets: Subsets, plans: Plans, variant: str, seed: int
-) -> Responses:
-    """Join the responses of all groups, in their order; all have the same number of passes."""
-    unknowns = renderer.camera.unknowns
-    whole = [on_all_rows(each, renderer.rows(name), subsets.get(name), unknowns) for name, each in parts.items()]
-    rows, variances, batches = zip(*whole, strict=True)
-    work = max(plans.values(), key=lambda plan: plan.samples)
-    return Responses(
-        matrix=sparse.csr_array(sparse.vstack(rows, format="csr")),
-        variance=np.concatenate(variances),
-        batches=np.concatenate(batches, axis=1),
-        passes=work.passes,
-        samples=work.samples,
-        variant=variant,
-        first_seed=sampler_seeds(seed, "calibration", 0, work.passes)(0),
-    )
+    return [sweep.part(plans[pixels.group]) for sweep, pixels in zip(sweeps, every, strict=True)]
 
 
 class SourceSweep:
@@ -156,10 +81,10 @@ class SourceSweep:
     uniform : (pixels,), of a uniform target
     """
 
-    def __init__(self, renderer: Renderer, group: str, subset: IntArray | None = None) -> None:
-        """Create an empty sweep of the pixels of a group, or of a subset of them."""
-        self._renderer, self._group, self._pixels = renderer, group, renderer.pixels(group, subset)
-        self.visible = visible_pixels(renderer, group, subset)
+    def __init__(self, renderer: Renderer, pixels: Pixels) -> None:
+        """Create an empty sweep of the pixels of a group."""
+        self._renderer, self._group, self._pixels = renderer, pixels.group, pixels
+        self.visible = visible_pixels(renderer, pixels)
         shape = self.visible.row.size, self.visible.spacing**2
         self.tally, self.uniform = Tally(*shape), Tally(shape[0])
         self.batches = np.zeros((BATCHES, *shape), dtype=np.float32)
@@ -196,12 +121,12 @@ class SourceSweep:
         self.batches[number % BATCHES] += (values * (BATCHES / work.passes)).astype(np.float32)
         self.tally.add(values)
 
-    def part(self, work: Plan) -> Part:
-        """Return the rows of H. Raises MachineError."""
+    def part(self, work: Plan) -> MeasuredRows:
+        """Return the rows of H of these pixels. Raises MachineError."""
         matrix, order = entries_of(self._renderer.camera, self.visible, self.tally.mean)
         _check_rows(matrix, self.uniform.mean, ROW_TOLERANCE + STRAYS / work.total)
         batches = (self.batches.reshape(BATCHES, -1)[:, order] - matrix.data).astype(np.float32)
-        return matrix, self.tally.variance.ravel()[order], batches
+        return MeasuredRows(matrix, self.tally.variance.ravel()[order], batches)
 
 
 def brightness(samples: int, exact_below: int) -> IntArray:
@@ -274,11 +199,11 @@ class VisiblePixels:
     spacing: int
 
 
-def visible_pixels(renderer: Renderer, group: str, subset: IntArray | None = None) -> VisiblePixels:
-    """Return the visible pixels of a group of the renderer, which is one lens type, or of a subset of its pixels."""
-    (lens_type,) = renderer.groups[group]
+def visible_pixels(renderer: Renderer, pixels: Pixels) -> VisiblePixels:
+    """Return the visible pixels of some pixels of a group of the renderer, which is one lens type."""
+    (lens_type,), numbers = renderer.groups[pixels.group], pixels.numbers
     visible = of_pinholes(renderer.camera, lens_type)
-    return visible if subset is None else replace(visible, row=visible.row[subset], column=visible.column[subset])
+    return replace(visible, row=visible.row[numbers], column=visible.column[numbers])
 
 
 def of_pinholes(camera: Camera, lens_type: LensType) -> VisiblePixels:

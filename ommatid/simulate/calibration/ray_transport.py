@@ -16,11 +16,9 @@ from scipy import sparse
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import sampler_seeds
-from ommatid.scenes.setup import Setup
+from ommatid.scenes.model import MeasuredRows
 
-from ..renderer.variant import check_transport_variant, choose
-from ..sampling.passes import BATCHES, Plan
-from .point_sources import Part, Plans, Responses, Subsets, joined_parts, same_plans
+from ..sampling.passes import BATCHES, Plan, Plans
 
 if TYPE_CHECKING:
     from ..renderer.rays import Pixels
@@ -34,36 +32,18 @@ class TracedEntries(NamedTuple):
     dark: BoolArray
 
 
-def responses_from_rays(
-    setup: Setup, progress: Progress = no_progress, plans: Plans | None = None, subsets: Subsets | None = None
-) -> Responses:
-    """Measure H by tracing all rays of all passes. Raises InputError if only Mitsuba's scalar backend works.
-
-    plans : of each group; None: all as the scene says
-    subsets : as for `responses_from_points`
-    """
-    from ..renderer.renderer import Renderer
-
-    scene, variant = setup.scene, choose(setup.scene.render.variant)
-    renderer = Renderer(setup.simulated, variant, scene.render.sampler, together=False)
-    check_transport_variant(variant)
-    plans = same_plans(setup) if plans is None else plans
-    parts: dict[str, list[Part]] = {group: [] for group in renderer.groups}
-    chosen: Subsets = dict.fromkeys(renderer.groups) if subsets is None else subsets
-    blocks = [
-        block
-        for group in renderer.groups
-        if group in chosen
-        for block in renderer.blocks(renderer.pixels(group, chosen[group]), plans[group].samples)
-    ]
+def rows_from_rays(
+    renderer: Renderer, blocks: list[Pixels], plans: Plans, seed: int, progress: Progress = no_progress
+) -> list[MeasuredRows]:
+    """Measure the rows of H of some blocks of pixels by tracing all rays of all passes."""
+    parts: list[MeasuredRows] = []
     for index, block in enumerate(blocks):
-        passes: list[TracedEntries] = []
-        work = plans[block.group]
+        passes, work = list[TracedEntries](), plans[block.group]
         for number in range(work.passes):
-            passes.append(one_pass(renderer, block, work, number, scene.render.seed))
+            passes.append(one_pass(renderer, block, work, number, seed))
             progress((index + (number + 1) / work.passes) / len(blocks))
-        parts[block.group].append(_joined(passes, (block.count, setup.camera.unknowns)))
-    return joined_parts(renderer, parts, chosen, plans, variant, scene.render.seed)
+        parts.append(_mean_of(passes, (block.count, renderer.camera.unknowns)))
+    return parts
 
 
 def one_pass(renderer: Renderer, pixels: Pixels, work: Plan, number: int, seed: int) -> TracedEntries:
@@ -86,7 +66,7 @@ def sums_by_texel(texels: IntArray, weights: FloatArray, unknowns: int) -> spars
     return summed
 
 
-def _joined(passes: list[TracedEntries], shape: tuple[int, int]) -> Part:
+def _mean_of(passes: list[TracedEntries], shape: tuple[int, int]) -> MeasuredRows:
     """Return the mean over the passes, the variance of that mean, and the deviations of batches of passes from it.
 
     A pixel that gets no light at all in some pass has no entries, since nothing is known of it.
@@ -111,7 +91,8 @@ def _joined(passes: list[TracedEntries], shape: tuple[int, int]) -> Part:
         deviation = -mean
         deviation[index] += of_pass.data
         squares += np.square(deviation)
-    return matrix, squares / (len(passes) * (len(passes) - 1)), (batches - mean).astype(np.float32)
+    variance = squares / (len(passes) * (len(passes) - 1))
+    return MeasuredRows(matrix, variance, (batches - mean).astype(np.float32))
 
 
 def positions_of(matrix: sparse.csr_array) -> IntArray:

@@ -18,7 +18,7 @@ from ommatid.runtime.machine import check_memory
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes, ring_masks
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces
 
-from ..calibration.point_sources import Responses
+from ..calibration.responses import Responses
 
 LEAST_RAYS = 20.0  # in a cell, of all pixels: the fewest that its weight assumes, since few rays are not Gaussian
 LEAST_SCATTER = 1e-3  # of independent rays' variance: the least that a weight assumes

@@ -27,7 +27,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.kernels import KernelFootprints, basis, terms
 from ommatid.scenes.lens_type import LensType
 
-from ..calibration.point_sources import Responses
+from ..calibration.responses import Responses
 from ..ideal import designed_kernels
 from .deviations import Chart, chart_of
 from .selection import Candidate, Components, choose, components

@@ -48,6 +48,9 @@ class Plan:
         return self.passes * self.samples
 
 
+Plans = dict[str, Plan]  # by the name of a lens type
+
+
 def plan(samples: int, sampler: Sampler = "multijitter") -> Plan:
     """Divide `samples` per pixel over at least 16 passes, rounded up to a grid that the sampler can fill."""
     passes = max(FEWEST_PASSES, BATCHES * ceil(samples / MOST_SAMPLES / BATCHES))

@@ -24,7 +24,7 @@ from ommatid.scenes.fitted.view import UNITS, designed
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import MeasuredRows
 
-from ..point_sources import Responses, Subsets
+from ..responses import Responses, Subsets
 from .chart import ChartRows, chart_of, chart_rows, freedom_of, side_for_kernels
 from .view_fit import SIGNIFICANCE, ViewFit, fit_views, predicted
 

@@ -15,7 +15,7 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.hardware.point_sources import UNKNOWN_VARIANCE
 from ommatid.scenes.model import Model, fitted_model, measured_rows
 
-from ..point_sources import Responses
+from ..responses import Responses
 from .fit import calibrate_by_fit, is_sharp
 
 DRAWS = 32  # of errors: with few, the F test refuses more than its significance says

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator
 
-from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
+from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 
 from .camera import Camera
@@ -307,6 +307,24 @@ class MeasuredRows:
     variance: FloatArray
     batches: Float32Array
 
+    def only(self, rows: BoolArray) -> MeasuredRows:
+        """Return the rows where `rows`, (M,), is true; all others are empty."""
+        counts = np.diff(self.matrix.indptr)
+        kept, starts = np.repeat(rows, counts), np.concatenate([[0], np.cumsum(np.where(rows, counts, 0))])
+        arrays = self.matrix.data[kept], self.matrix.indices[kept], starts
+        matrix = sparse.csr_array(arrays, shape=self.matrix.shape)
+        return MeasuredRows(matrix, self.variance[kept], self.batches[:, kept])
+
+    def joined(self, other: MeasuredRows) -> MeasuredRows:
+        """Return the rows of both, each of which is empty in one of them; entries of value 0 stay."""
+        parts = self.matrix, other.matrix
+        rows = np.concatenate([np.repeat(np.arange(part.shape[0]), np.diff(part.indptr)) for part in parts])
+        order = np.argsort(rows, kind="stable")
+        data, indices = (np.concatenate([getattr(part, name) for part in parts])[order] for name in ("data", "indices"))
+        matrix = sparse.csr_array((data, indices, parts[0].indptr + parts[1].indptr), shape=parts[0].shape)
+        variance = np.concatenate([self.variance, other.variance])[order]
+        return MeasuredRows(matrix, variance, np.concatenate([self.batches, other.batches], axis=1)[:, order])
+
 
 def fitted_model(
     scene: Scene, camera: Camera, fitted: FittedMatrix, rest: MeasuredRows | None, record: dict[str, Any]
@@ -317,20 +335,9 @@ def fitted_model(
         count = 0 if entries is None else int(entries.nnz)
         return Model(scene, camera, entries, np.zeros(count), np.zeros((0, count), np.float32), record, fitted=fitted)
     explained = fitted.to_sparse()
-    matrix = _merged(explained, rest.matrix)
-    rows = np.repeat(np.diff(rest.matrix.indptr) > 0, np.diff(matrix.indptr))  # stored in rows that were measured
-    variance, batches = np.zeros(matrix.nnz), np.zeros((len(rest.batches), matrix.nnz), np.float32)
-    variance[rows], batches[:, rows] = rest.variance, rest.batches
-    return Model(scene, camera, matrix, variance, batches, record, fitted=fitted)
-
-
-def _merged(first: sparse.csr_array, second: sparse.csr_array) -> sparse.csr_array:
-    """Return the rows of two matrices, each of which is empty in one of them; entries of value 0 stay."""
-    parts = first, second
-    rows = np.concatenate([np.repeat(np.arange(part.shape[0]), np.diff(part.indptr)) for part in parts])
-    order = np.argsort(rows, kind="stable")
-    data, indices = (np.concatenate([getattr(part, name) for part in parts])[order] for name in ("data", "indices"))
-    return sparse.csr_array((data, indices, first.indptr + second.indptr), shape=first.shape)
+    exact = MeasuredRows(explained, np.zeros(explained.nnz), np.zeros((len(rest.batches), explained.nnz), np.float32))
+    rows = exact.joined(rest)
+    return Model(scene, camera, rows.matrix, rows.variance, rows.batches, record, fitted=fitted)
 
 
 def measured_rows(model: Model) -> MeasuredRows | None:
@@ -341,9 +348,4 @@ def measured_rows(model: Model) -> MeasuredRows | None:
     named = [views.explained for views in (fitted.views[lens.name] for lens in model.camera.types)]
     explained = np.concatenate(named)
     sizes = [place.stop - place.start for place in model.camera.slices()]
-    counts = np.diff(model.stored.indptr)
-    kept = np.repeat(np.repeat(~explained, sizes), counts)
-    indptr = np.concatenate([[0], np.cumsum(counts * np.repeat(~explained, sizes))])
-    arrays = (model.stored.data[kept], model.stored.indices[kept], indptr)
-    matrix = sparse.csr_array(arrays, shape=model.stored.shape)
-    return MeasuredRows(matrix, model.variance[kept], model.batches[:, kept])
+    return MeasuredRows(model.stored, model.variance, model.batches).only(np.repeat(~explained, sizes))

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import sparse, special
+from scipy import special
 
-from ommatid.runtime.arrays import Float32Array, FloatArray, IntArray
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, designed_views, views_as_designed
@@ -208,25 +208,12 @@ def _rest(
     charted : lens types of which the first responses hold but a part;  measured : these, and those of all pixels of
         what they do not explain
     """
-    matrices: list[sparse.csr_array] = []
-    kept_variances: list[FloatArray] = []
-    kept_batches: list[Float32Array] = []
-    sources = [(each, variances(each)) for each in measured if each is not None]
     sizes = [place.stop - place.start for place in camera.slices()]
     explained = np.repeat(np.concatenate([fits[lens.name].views.explained for lens in camera.types]), sizes)
-    for lens, rows in zip(camera.types, camera.type_slices(), strict=True):
-        responses, variance = sources[-1] if charted[lens.name] else sources[0]
-        pointers = responses.matrix.indptr
-        stored = slice(int(pointers[rows.start]), int(pointers[rows.stop]))
-        part = responses.matrix[rows]
-        kept = np.repeat(~explained[rows], np.diff(part.indptr))
-        counts = np.where(explained[rows], 0, np.diff(part.indptr))
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        matrices.append(sparse.csr_array((part.data[kept], part.indices[kept], starts), shape=part.shape))
-        kept_variances.append(variance[stored][kept])
-        kept_batches.append(responses.batches[:, stored][:, kept])
-    matrix = sparse.csr_array(sparse.vstack(matrices, format="csr"))
-    return MeasuredRows(matrix, np.concatenate(kept_variances), np.concatenate(kept_batches, axis=1))
+    in_part = np.repeat([charted[lens.name] for lens in camera.types], [lens.measurements for lens in camera.types])
+    first, *more = (MeasuredRows(each.matrix, variances(each), each.batches) for each in measured if each is not None)
+    rest = first.only(~explained & ~in_part)
+    return rest.joined(more[0].only(~explained & in_part)) if more else rest
 
 
 def _record(camera: Camera, fits: dict[str, _TypeFit], subsets: Subsets) -> dict[str, Any]:

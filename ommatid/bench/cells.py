@@ -26,10 +26,10 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import Sampler
-from ommatid.simulate.adaptive_render import AdaptiveRendering, check_noise_target
+from ommatid.simulate.adaptive_render import check_noise_target
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.render import Rendering
 from ommatid.simulate.renderer.variant import PREFERENCE, release, unusable_reason
+from ommatid.simulate.sampling.passes import Rendering
 
 from . import reference
 from .precision import ExactSolution, SolverSetting, exact_solution, solver_settings
@@ -168,10 +168,10 @@ class Subject:
         """True if the solver is a frame or tiles, which are slow for a different noise variance in every pixel."""
         return self.camera.unknowns > MOST_DENSE
 
-    def rendering_mse(self, rendering: Rendering | AdaptiveRendering, repeat: int) -> float:
+    def rendering_mse(self, rendering: Rendering, repeat: int) -> float:
         """Return the mean squared error of the image from a rendering and exact H, normalised."""
         setup = self.noise(repeat)
-        single_pass = isinstance(rendering, Rendering) and rendering.passes == 1  # with unknown variance
+        single_pass = rendering.passes == 1  # with unknown variance
         if self.is_large or single_pass:
             stack = reference.record_light(setup, rendering.mean, self.reference)
         else:
@@ -270,7 +270,7 @@ def _rendering(subject: Subject, variant: str, sampler: Sampler, samples: Sample
         rendering, seconds, memory = measured(lambda: reference.render_light(subject.changed(scene)))
         error = reference.light_error(rendering, subject.reference)
         mse = subject.rendering_mse(rendering, repeat) if repeat < FEWER_REPEATS else None
-        return Repeat(error, seconds, memory, mse, int(rendering.record()["samples"]))
+        return Repeat(error, seconds, memory, mse, int(rendering.record["samples"]))
 
     return Job("render", sampler, variant, total, setting, repeated)
 

@@ -18,11 +18,11 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import Sampler
-from ommatid.simulate.adaptive_render import AdaptiveRendering, render_until
+from ommatid.simulate.adaptive_render import render_until
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
-from ommatid.simulate.render import Rendering, exposed, light
-from ommatid.simulate.sampling.passes import FEWEST_PASSES, Plan, plan
+from ommatid.simulate.render import exposed, light
+from ommatid.simulate.sampling.passes import FEWEST_PASSES, Plan, Rendering, plan
 from ommatid.simulate.sampling.samplers import fitting
 
 Samples = int | Literal["auto"]
@@ -88,7 +88,7 @@ def sample_plan(samples: int, sampler: Sampler) -> Plan:
     return plan(samples, sampler) if samples >= FEWEST_PASSES else Plan(1, fitting(sampler, samples))
 
 
-def render_light(setup: Setup) -> Rendering | AdaptiveRendering:
+def render_light(setup: Setup) -> Rendering:
     """Render the light without the sensor's noise, as `run` does."""
     render = setup.scene.render
     if render.samples == "auto":
@@ -96,7 +96,7 @@ def render_light(setup: Setup) -> Rendering | AdaptiveRendering:
     return light(setup, work=sample_plan(render.sample_count, render.sampler))
 
 
-def light_error(rendering: Rendering | AdaptiveRendering, right: Reference) -> float:
+def light_error(rendering: Rendering, right: Reference) -> float:
     """Return the root mean square error over sensor pixels, in values of f, without the variance of the reference."""
     squares = np.square(rendering.mean - right.light) - right.variance
     return float(np.sqrt(max(np.nanmean(squares), 0.0)))
@@ -109,9 +109,9 @@ def model_error(model: Model, right: Reference) -> float:
     return float(np.sqrt(max(squares, 0.0) / right.model.entries))
 
 
-def record_rendering(setup: Setup, rendering: Rendering | AdaptiveRendering) -> Stack:
+def record_rendering(setup: Setup, rendering: Rendering) -> Stack:
     """Return a rendering of several passes as the scene's sensor records it, with noise from the scene's seed."""
-    return exposed(setup, rendering.mean, rendering.stated_variance(setup.camera), {})
+    return exposed(setup, rendering.mean, rendering.stated, {})
 
 
 def record_light(setup: Setup, light: FloatArray, right: Reference) -> Stack:

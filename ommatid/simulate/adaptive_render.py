@@ -33,7 +33,6 @@ from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import sampler_seeds
-from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.recording import expected_recording_of, flat_values
 from ommatid.scenes.scene import Scene
@@ -47,6 +46,7 @@ from .sampling.passes import (
     AVERAGED,
     MOST_SAMPLES,
     Plan,
+    Rendering,
     Tally,
     cells_of,
     exact_plan,
@@ -78,34 +78,12 @@ TIMED = 2**20  # rays whose time tells the speed: fewer take the time of compila
 WORTH = 0.5  # of the planned rays, below which fewer samples are offered
 
 
-@dataclass(frozen=True)
-class AdaptiveRendering:
-    """Light on every sensor pixel, (M,), and its variance, shrunk and never below rounding, (M,).
-
-    direct_only : True if interreflections in a world were left out, since nothing there reflects
-    """
-
-    mean: FloatArray
-    variance: FloatArray
-    details: dict[str, Any]
-    direct_only: bool
-
-    def stated_variance(self, camera: Camera) -> FloatArray:
-        """Return the variance."""
-        del camera
-        return self.variance
-
-    def record(self) -> dict[str, Any]:
-        """Return the entries for the stack's record."""
-        return self.details
-
-
 def render_until(
     setup: Setup,
     progress: Progress = no_progress,
     checkpoint: Checkpoint | None = None,
     clock: Callable[[], float] = perf_counter,
-) -> AdaptiveRendering:
+) -> Rendering:
     """Render until every sub-imager's variance is small compared with the sensor's, or `render.time` is over.
 
     The first round is rendered whatever the time, so that every pixel has a value. Raises InputError if the sensor
@@ -141,11 +119,9 @@ def render_until(
             save()
             progress(1 - len(rounds.unfinished) / len(rounds.sub_imagers))
     progress(1.0)
-    details = {"variant": variant, **rounds.record()}
-    received = setup.camera.received
-    return AdaptiveRendering(
-        received * rounds.mean, np.square(received) * rounds.variance, details, renderer.direct_only
-    )
+    record, received = {"variant": variant, **rounds.record()}, setup.camera.received
+    variance = np.square(received) * rounds.variance
+    return Rendering(received * rounds.mean, variance, variance, record, renderer.direct_only)
 
 
 def _warn_of_cost(rounds: AdaptiveRounds, speed: float) -> bool:

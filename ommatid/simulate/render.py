@@ -6,7 +6,7 @@ stack is reused from its file while its fingerprint matches the scene.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -33,36 +33,25 @@ from .renderer.rays import Pixels
 from .renderer.renderer import Renderer
 from .renderer.variant import choose, release
 from .sampling.checkpoint import Checkpoint, State, open_checkpoint
-from .sampling.passes import OverPasses, Plan, Tally, plan, rounding_variance
+from .sampling.passes import OverPasses, Plan, Rendering, Tally, plan, rounding_variance
 from .world_view import rendered_world
 
 NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle
 BAND = 2**22  # sensor pixels, at most, unless rays that start together are of more
 
 
-@dataclass(frozen=True)
-class Rendering(OverPasses):
-    """Light on every sensor pixel, (M,): the mean of the passes, and the variance of that mean from their scatter.
+def stated_variance(camera: Camera, mean: FloatArray, variance: FloatArray, work: Plan) -> FloatArray:
+    """Return the variance of a mean over passes, (M,), shrunk among pixels with like neighbours.
 
-    direct_only : True if interreflections in a world were left out, since nothing there reflects
+    It is never below float32's rounding, and 0 of pixels that no light reaches, whose reading is not a number.
     """
-
-    mean: FloatArray
-    variance: FloatArray
-    direct_only: bool
-
-    def stated_variance(self, camera: Camera) -> FloatArray:
-        """Return the variance, (M,), shrunk among pixels with like neighbours, and never below float32's rounding.
-
-        It is 0 of pixels that no light reaches, whose reading is not a number.
-        """
-        stated, known = np.empty_like(self.variance), np.nan_to_num(self.variance, nan=0.0)
-        for lens_type, rows in zip(camera.types, camera.type_slices(), strict=True):
-            images = known[rows].reshape(lens_type.count, *lens_type.pixels)
-            around = np.concatenate([mean_of_neighbours(image).ravel() for image in images])
-            shrunk = posterior_variances_among(known[rows], around, self.passes)
-            stated[rows] = np.maximum(shrunk, rounding_variance(np.nan_to_num(self.mean[rows], nan=0.0), self.samples))
-        return stated
+    stated, known = np.empty_like(variance), np.nan_to_num(variance, nan=0.0)
+    for lens_type, rows in zip(camera.types, camera.type_slices(), strict=True):
+        images = known[rows].reshape(lens_type.count, *lens_type.pixels)
+        around = np.concatenate([mean_of_neighbours(image).ravel() for image in images])
+        shrunk = posterior_variances_among(known[rows], around, work.passes)
+        stated[rows] = np.maximum(shrunk, rounding_variance(np.nan_to_num(mean[rows], nan=0.0), work.samples))
+    return stated
 
 
 def mean_of_neighbours(image: FloatArray) -> FloatArray:
@@ -118,15 +107,10 @@ def light(
     mean, variance = render_bands(renderer, scene.render.seed, work, progress, checkpoint)
     mean *= setup.camera.received
     variance *= np.square(setup.camera.received)
-    return Rendering(
-        passes=work.passes,
-        samples=work.samples,
-        variant=variant,
-        first_seed=sampler_seeds(scene.render.seed, "data", 0, work.passes)(0),
-        mean=mean,
-        variance=variance,
-        direct_only=renderer.direct_only,
-    )
+    first_seed = sampler_seeds(scene.render.seed, "data", 0, work.passes)(0)
+    record = OverPasses(work.passes, work.samples, variant, first_seed).record()
+    stated = variance if work.passes == 1 else stated_variance(setup.camera, mean, variance, work)
+    return Rendering(mean, variance, stated, record, renderer.direct_only)
 
 
 def render(
@@ -154,12 +138,12 @@ def render(
         "seconds": perf_counter() - start,
         "seed": scene.render.seed,
         "sampler": scene.render.sampler,
-        **rendering.record(),
+        **rendering.record,
         **({STRAIGHT: True} if rendering.direct_only else {}),
         **({} if world is None or world.world is None else {"white": world.world.white}),
         "versions": versions("mitsuba", "drjit", "OpenEXR"),
     }
-    return exposed(setup, rendering.mean, rendering.stated_variance(setup.camera), record)
+    return exposed(setup, rendering.mean, rendering.stated, record)
 
 
 def exposed(setup: Setup, light: FloatArray, variance: FloatArray, record: dict[str, Any]) -> Stack:

@@ -150,7 +150,8 @@ def test_rendered_against_the_closed_form(variant: str, optics: str, rotation: s
     render = {"variant": variant, "samples": 4096, "complete": True}
     setup = Setup.from_scene(steered(named, more=OPTICS[optics], render=render))
     rendering = light(setup)
-    variance = np.maximum(rendering.variance, rounding_variance(rendering.mean, rendering.samples))
+    samples = rendering.record["samples"] // rendering.passes
+    variance = np.maximum(rendering.variance, rounding_variance(rendering.mean, samples))
     assert_student(rendering.mean - ideal_matrix(setup.camera) @ setup.image.ravel(), variance, rendering.passes)
 
 

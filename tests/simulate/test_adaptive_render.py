@@ -27,14 +27,21 @@ from ommatid.simulate.adaptive_render import (
     SAMPLES,
     SHARE,
     TIME,
-    AdaptiveRendering,
     render_until,
 )
 from ommatid.simulate.calibrate import cached_model, calibrate
 from ommatid.simulate.calibration.adaptive_rounds import GOAL, StoppingRule
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import cached_stack, render
-from ommatid.simulate.sampling.passes import EXACT_PASSES, Plan, cells_of, on_grid, rounding_variance, samples_within
+from ommatid.simulate.sampling.passes import (
+    EXACT_PASSES,
+    Plan,
+    Rendering,
+    cells_of,
+    on_grid,
+    rounding_variance,
+    samples_within,
+)
 from ommatid.simulate.sampling.sample_law import SampleLaw
 
 from ..conftest import Command
@@ -50,7 +57,7 @@ def auto(shape: tuple[int, int] = (19, 19), lenses: Any = THREE, **render: Any) 
     return scene(shape, lenses, render=AUTO | render, noise={"variance": 1e-2})
 
 
-def lit(described: Scene, **more: Any) -> AdaptiveRendering:
+def lit(described: Scene, **more: Any) -> Rendering:
     return render_until(Setup.from_scene(described), **more)
 
 
@@ -116,7 +123,7 @@ def test_values_do_not_depend_on_the_number_of_threads(variant: str) -> None:
     import drjit as dr
 
     described = auto(variant=variant, lenses=FRACTIONAL)
-    before, found = dr.thread_count(), list[AdaptiveRendering]()
+    before, found = dr.thread_count(), list[Rendering]()
     try:
         for threads in (1, 5):
             dr.set_thread_count(threads)
@@ -125,18 +132,18 @@ def test_values_do_not_depend_on_the_number_of_threads(variant: str) -> None:
         dr.set_thread_count(before)
     assert found[0].mean.tobytes() == found[1].mean.tobytes()
     assert found[0].variance.tobytes() == found[1].variance.tobytes()
-    assert found[0].details == found[1].details
+    assert found[0].record == found[1].record
 
 
 def test_the_time_limit_ends_rendering_after_the_first_round() -> None:
     ticks = iter(range(10**6))
     described = auto(sampler="independent", time="3 s")
     found = lit(described, clock=lambda: float(next(ticks)))
-    assert not found.details["reached"]
-    assert set(found.details["not_reached"].values()) == {TIME}
+    assert not found.record["reached"]
+    assert set(found.record["not_reached"].values()) == {TIME}
     assert (found.variance > 0).all()
-    assert found.details["fewest_samples"] >= LEAST
-    assert found.details["samples"] < 2 * LEAST, "11,900 without a limit"
+    assert found.record["fewest_samples"] >= LEAST
+    assert found.record["samples"] < 2 * LEAST, "11,900 without a limit"
     endless = lit(auto(lenses=THREE[:1], time="1e9 s"), clock=lambda: 0.0)
     assert endless.mean.tobytes() == lit(auto(lenses=THREE[:1])).mean.tobytes(), (
         "an unused time limit changes no exact rendering"
@@ -154,7 +161,7 @@ def test_a_long_rendering_says_what_it_costs(caplog: pytest.LogCaptureFixture, m
         monkeypatch.setattr("ommatid.simulate.adaptive_render.WORTH", worth)
         ticks = iter(range(0, 10**9, 100))
         found = lit(described, clock=lambda ticks=ticks: float(next(ticks)))
-        assert found.details["rounds"] > 1
+        assert found.record["rounds"] > 1
         (message,) = caplog.messages
         assert re.search(r"'auto' takes about .* more \(.*e\+.* rays\)", message)
         assert ("; on average it is with render.samples = " in message) == offered
@@ -168,13 +175,13 @@ def test_an_unreachable_target_is_recorded_with_its_reason(monkeypatch: pytest.M
     silent = scene(
         (14, 14), FRACTIONAL[:1], render={"samples": "auto", "variant": "scalar_rgb"}, noise={"variance": 1e-12}
     )
-    assert set(lit(silent).details["not_reached"].values()) <= {FLOAT32, SAMPLES}
-    assert lit(silent).details["not_reached"], "float32 does not resolve 1e-6 of 255"
+    assert set(lit(silent).record["not_reached"].values()) <= {FLOAT32, SAMPLES}
+    assert lit(silent).record["not_reached"], "float32 does not resolve 1e-6 of 255"
     monkeypatch.setattr("ommatid.simulate.adaptive_render.MOST", 2048)
     few = auto((14, 14), FRACTIONAL[:1], sampler="independent")
     found = lit(few)
-    assert set(found.details["not_reached"].values()) == {SAMPLES}
-    assert found.details["samples"] <= 2 * 2048 + LEAST
+    assert set(found.record["not_reached"].values()) == {SAMPLES}
+    assert found.record["samples"] <= 2 * 2048 + LEAST
 
 
 @pytest.mark.parametrize("sets", [["noise.variance="], ["noise.variance=0"]], ids=["no noise", "noise of 0"])

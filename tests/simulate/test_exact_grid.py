@@ -53,7 +53,7 @@ def test_two_passes_show_every_pixel_without_error(variant: str) -> None:
     rendering = render_until(setup)
     away = rendering.mean - ideal_matrix(setup.camera) @ setup.image.astype(np.float32).ravel()
     if variant.startswith("llvm"):
-        assert rendering.details["samples"] == 2 * 8**2, "8 x 8 cells where m = 8/3"
+        assert rendering.record["samples"] == 2 * 8**2, "8 x 8 cells where m = 8/3"
         assert (away**2 <= 16 * rendering.variance).all()
     assert np.median(away**2 / rendering.variance) < 1
 
@@ -73,7 +73,7 @@ def test_samples_keep_away_from_edges_by_what_float32_rounds(monkeypatch: pytest
         return int(((values - expected) ** 2 > 16 * rounding_variance(expected, 1)).sum())
 
     assert wrong() == 0
-    assert render_until(setup).details["rounds"] == 1
+    assert render_until(setup).record["rounds"] == 1
     monkeypatch.setattr(passes, "ROUNDINGS", 0)
     assert wrong() > 0, "at the edge of this target, rays are rounded into the next pixel"
 
@@ -128,7 +128,7 @@ def test_averages_of_pinholes_are_the_closed_form(lens: dict[str, Any], camera: 
     error = rendering.mean - true_matrix(setup.camera) @ setup.image.ravel()
     assert np.abs(error).max() < 1e-3
     assert float(np.mean(error**2 / rendering.variance)) < 1
-    assert rendering.details["rounds"] == 1
+    assert rendering.record["rounds"] == 1
 
 
 @pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 3), marks=pytest.mark.slow)], ids=["one", "more"])

@@ -137,7 +137,7 @@ def test_slits_before_pinholes_are_rendered_without_error(part: Part) -> None:
     setup = Setup.from_scene(described)
     rendering = render_until(setup)
     np.testing.assert_allclose(rendering.mean, ideal_matrix(camera) @ setup.image.ravel(), atol=2e-3)
-    assert rendering.details["samples"] <= 256, "in a round or two"
+    assert rendering.record["samples"] <= 256, "in a round or two"
 
 
 @pytest.mark.parametrize("name", ["pinholes", *(pytest.param(each, marks=SLOW) for each in ("rotated", "diffracting"))])

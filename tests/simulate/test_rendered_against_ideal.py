@@ -21,8 +21,8 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.calibration.responses import measured
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.render import Rendering, light
-from ommatid.simulate.sampling.passes import rounding_variance
+from ommatid.simulate.render import light
+from ommatid.simulate.sampling.passes import Rendering, rounding_variance
 from ommatid.simulate.sampling.samplers import corners, fitting
 
 from ..examples import SLOW_SCALAR, THREE, VARIANTS, assert_student, familywise, needs, scene
@@ -44,7 +44,8 @@ def ideal(setup: Setup) -> NDArray[np.float64]:
 
 def variance_of(rendering: Rendering) -> NDArray[np.float64]:
     """Return the variance of a rendering from its passes, never below float32's rounding, (M,)."""
-    return np.maximum(rendering.variance, rounding_variance(rendering.mean, rendering.samples))
+    samples = rendering.record["samples"] // rendering.passes
+    return np.maximum(rendering.variance, rounding_variance(rendering.mean, samples))
 
 
 def effective_number(variance: NDArray[np.float64]) -> float:
@@ -63,7 +64,7 @@ def test_sub_images_of_a_photograph(variant: str, sampler: Sampler) -> None:
     setup = three_types(variant, samples, sampler)
     rendering = light(setup)
     assert rendering.passes == 16
-    assert rendering.record()["samples"] == 16 * fitting(sampler, samples // 16)
+    assert rendering.record["samples"] == 16 * fitting(sampler, samples // 16)
     assert_student(rendering.mean - ideal(setup), variance_of(rendering), rendering.passes)
 
 

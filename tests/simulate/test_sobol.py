@@ -108,8 +108,8 @@ def test_stated_variances_are_those_of_the_error() -> None:
     for seed in range(20):
         setup = out_of_focus(seed)
         rendering = render_until(setup)
-        assert rendering.details["sampler"] == "sobol"
-        assert rendering.details["reached"]
+        assert rendering.record["sampler"] == "sobol"
+        assert rendering.record["reached"]
         error = rendering.mean - ideal_matrix(setup.camera) @ setup.image.ravel()
         ratios.append(float(np.sum(error**2) / np.sum(rendering.variance)))
     mean, deviation = np.mean(ratios), np.std(ratios, ddof=1) / len(ratios) ** 0.5
@@ -146,4 +146,4 @@ def test_averages_over_pixels_are_those_of_the_closed_form(
 
 
 def test_another_sampler_is_respected() -> None:
-    assert render_until(out_of_focus(sampler="independent", noise=30.0)).details["sampler"] == "independent"
+    assert render_until(out_of_focus(sampler="independent", noise=30.0)).record["sampler"] == "independent"

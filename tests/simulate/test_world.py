@@ -19,10 +19,11 @@ from ommatid.scenes.scene import TRUTH, parse
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.ground_truth import truth
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.render import Rendering, cached_stack, light
+from ommatid.simulate.render import cached_stack, light
 from ommatid.simulate.renderer.rays import Pixels, Seed
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.world import files, has_interreflections, stage
+from ommatid.simulate.sampling.passes import Rendering
 
 from ..examples import SLOW_SCALAR, VARIANTS, assert_student, needs
 from ..examples import scene as flat_scene

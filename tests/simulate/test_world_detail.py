@@ -63,7 +63,7 @@ def test_the_fine_picture_is_rendered() -> None:
     setup = Setup.from_scene(detailed(4, render={"samples": 4096}))
     rendering = light(setup)
     exact = ideal_matrix(setup.world.camera) @ setup.world.image.ravel()
-    score = (rendering.mean - exact) / np.sqrt(rendering.stated_variance(setup.camera))
+    score = (rendering.mean - exact) / np.sqrt(rendering.stated)
     smallest = 2 * float(stats.t.sf(np.abs(score).max(), rendering.passes - 1))
     assert 1 - (1 - smallest) ** score.size > 1e-3
     blurred = ideal_matrix(replace(setup.camera, detail=1)) @ setup.image.ravel()

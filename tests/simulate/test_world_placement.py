@@ -16,9 +16,10 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.world import MILLIMETRES, WorldTable
 from ommatid.simulate.ground_truth import Truth, truth
-from ommatid.simulate.render import Rendering, light
+from ommatid.simulate.render import light
 from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.renderer.worlds.placement import Placement
+from ommatid.simulate.sampling.passes import Rendering
 
 from ..examples import needs
 from .world_files import FAST, Z, glow, rectangle, world

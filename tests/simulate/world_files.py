@@ -10,8 +10,7 @@ import numpy as np
 
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse
-from ommatid.simulate.render import Rendering
-from ommatid.simulate.sampling.passes import rounding_variance
+from ommatid.simulate.sampling.passes import Rendering, rounding_variance
 
 from ..examples import Lenses
 from ..examples import scene as flat_scene
@@ -58,7 +57,8 @@ def world(
 
 
 def floored(rendering: Rendering) -> Any:
-    return np.maximum(rendering.variance, rounding_variance(rendering.mean, rendering.samples))
+    samples = rendering.record["samples"] // rendering.passes
+    return np.maximum(rendering.variance, rounding_variance(rendering.mean, samples))
 
 
 def distance_to_target(renderer: Renderer) -> Distance:

@@ -167,7 +167,7 @@ def world_variance(setup: Setup, plans: Plans) -> tuple[FloatArray, bool]:
     render = changed.scene.render.model_copy(update={"samples": few.total})
     rendering = light(replace(changed, scene=with_tables(changed.scene, render=render)), work=few)
     factor, extrapolated = _factor(setup.camera, dict.fromkeys(plans, few), plans, SampleLaw())
-    return factor * rendering.stated_variance(setup.camera), extrapolated
+    return factor * rendering.stated, extrapolated
 
 
 def _factor(camera: Camera, traced: Plans, plans: Plans, law: SampleLaw) -> tuple[FloatArray, bool]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 from math import ceil, isqrt, lcm
+from typing import Any
 
 import numpy as np
 
@@ -101,6 +102,27 @@ class OverPasses:
             "variant": self.variant,
             "first_seed": self.first_seed,
         }
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Light on every sensor pixel, (M,): the mean of passes, and the variance of that mean from their scatter.
+
+    stated : (M,) the variance, shrunk among the pixels and never below rounding; as it is of a single pass
+    record : entries for the stack's record
+    direct_only : True if interreflections in a world were left out, since nothing there reflects
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    stated: FloatArray
+    record: dict[str, Any]
+    direct_only: bool
+
+    @property
+    def passes(self) -> int:
+        """Number of passes, of all rounds if there were several."""
+        return int(self.record["passes"])
 
 
 class Tally:

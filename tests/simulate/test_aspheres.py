@@ -17,8 +17,9 @@ from ommatid.simulate.lenses.ray_trace import (
     Disk,
     exit_disk,
     meet_asphere,
+    path,
     spread,
-    trace_path,
+    trace,
 )
 
 from ..lenses import BICONVEX, camera_with, lens
@@ -53,10 +54,10 @@ def test_a_sphere_is_another_conic_and_a_polynomial(of: float) -> None:
     )
     disk = exit_disk(sphere, 1.5, 0.1)
     across, down = spread(500)
-    first, second = (trace_path(one, disk, 0.1, 0.02, across, down, 1.5) for one in (sphere, other))
+    first, second = (trace(path(one, disk), 0.1, 0.02, across, down, 1.5) for one in (sphere, other))
     same(first, second, 1e-12)
     assert 0.5 < np.mean(first[2] > 0) < 1
-    without = trace_path(replace(other, aspheric=()), disk, 0.1, 0.02, across, down, 1.5)
+    without = trace(path(replace(other, aspheric=()), disk), 0.1, 0.02, across, down, 1.5)
     assert np.abs(without[3] - first[3]).max() > 1e-6
     assert other.sag(0.1) == pytest.approx(sphere.sag(0.1), rel=1e-12)
     assert other.last_extent() == pytest.approx(sphere.last_extent(), abs=1e-14)
@@ -100,15 +101,15 @@ def test_strong_aspheres_are_met_where_bisection_finds_them(seed: int) -> None:
 def test_scaling_a_lens_scales_its_polynomial() -> None:
     one = replace(lens([1.0, -1.2], [0.2], [1.5, 1.0], 0.15), aspheric=((0.5, -3.0), (1.0, 2.0, -40.0)))
     disk, across, down = exit_disk(one, 1.5, 0.05), *spread(100)
-    point, direction, weight, length = trace_path(one, disk, 0.03, 0.01, across, down, 1.5)
+    point, direction, weight, length = trace(path(one, disk), 0.03, 0.01, across, down, 1.5)
     assert np.mean(weight > 0) > 0.5
     for factor in (1e-3, 40.0):
         wide = Disk(disk.height * factor, disk.radius * factor)
-        places = wide, 0.03 * factor, 0.01 * factor, across, down, 1.5 * factor
-        scaled = trace_path(one.scaled(factor), *places)
+        places = 0.03 * factor, 0.01 * factor, across, down, 1.5 * factor
+        scaled = trace(path(one.scaled(factor), wide), *places)
         expected = (tuple(value * factor for value in point), direction, weight, length * factor)
         same(scaled, expected, 1e-12 * max(factor, 1))
-        unscaled = trace_path(replace(one.scaled(factor), aspheric=one.aspheric), *places)[1]
+        unscaled = trace(path(replace(one.scaled(factor), aspheric=one.aspheric), wide), *places)[1]
         assert np.abs(np.array(unscaled) - direction).max() > 1e-3, "the polynomial has an effect"
 
 
@@ -116,7 +117,7 @@ def test_rays_that_miss_an_asphere_are_blocked_and_leave_numbers() -> None:
     one = replace(lens([0.2, -1.0], [0.3], [1.5, 1.0], 0.19, conic=[0.5, 0.0]), aspheric=((200.0,), (-3.0,)))
     across, down = (number * 8 for number in spread(400))
     with np.errstate(all="raise"):
-        (x, y), direction, weight, length = trace_path(one, Disk(0.1, 0.2), 0.2, 0.0, across, down, 0.4)
+        (x, y), direction, weight, length = trace(path(one, Disk(0.1, 0.2)), 0.2, 0.0, across, down, 0.4)
     assert 0 < np.mean(weight > 0) < 0.2
     assert np.all(np.isfinite([x, y, *direction, length]))
     assert np.all(length[weight == 0] == 0)
@@ -129,7 +130,7 @@ def gradient_error(one: Prescription, depth: float) -> float:
     """
     disk = exit_disk(one, depth, 0.05)
     across, down = (number * 0.9 for number in spread(40))
-    _, (u, v, _), weight, _ = trace_path(one, disk, 0.04, 0.02, across, down, depth)
+    _, (u, v, _), weight, _ = trace(path(one, disk), 0.04, 0.02, across, down, depth)
     worst = 0.0
     for axis in (0, 1):
         total = np.zeros((3, 40))
@@ -137,7 +138,7 @@ def gradient_error(one: Prescription, depth: float) -> float:
             for sign in (-1, 1):
                 move = sign * count * 0.01
                 moved = across + move * (1 - axis), down + move * axis
-                point, _, _, length = trace_path(one, disk, 0.04, 0.02, *moved, depth)
+                point, _, _, length = trace(path(one, disk), 0.04, 0.02, *moved, depth)
                 total += sign * share / 0.01 * np.stack([*point, length])
         dx, dy, dl = total
         error = np.abs(dl - u * dx - v * dy) / disk.radius
@@ -161,7 +162,7 @@ def test_a_hyperbola_sends_out_light_of_equal_path() -> None:
     back = 1 / (index - 1)  # from the vertex to the focus
     assert perfect.rear_principal + perfect.focal_length == pytest.approx(thickness + back)
     disk = exit_disk(perfect, perfect.focal_length, 0.0)
-    _, (u, v, _), weight, length = trace_path(perfect, disk, 0.0, 0.0, *spread(300), perfect.focal_length)
+    _, (u, v, _), weight, length = trace(path(perfect, disk), 0.0, 0.0, *spread(300), perfect.focal_length)
     lit = weight > 0
     assert np.mean(lit) > 0.8
     np.testing.assert_allclose((u[lit], v[lit]), 0, atol=1e-12)

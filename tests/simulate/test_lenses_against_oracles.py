@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ommatid.scenes.formats.lens_file import read_lens
 from ommatid.simulate.lenses.prescription import Prescription, prescribe
-from ommatid.simulate.lenses.ray_trace import Disk, trace_path
+from ommatid.simulate.lenses.ray_trace import Disk, path, trace
 
 from ..lenses import turned_round
 from .oracle_rays import HEIGHTS, WAVELENGTH, pupil_points
@@ -37,8 +37,8 @@ def image(one: Prescription, name: str, height: float) -> Array:
     rear = turned.rear_principal - float(turned.vertices[-1])
     distance = turned.front_principal + ROWS[name][-1][1]
     across, down = np.array(pupil_points())
-    (x, y), (u, v, w), weight, length = trace_path(
-        turned, Disk(rear, PUPIL[name] / 2), 0.0, height, across, down, OBJECT - rear
+    (x, y), (u, v, w), weight, length = trace(
+        path(turned, Disk(rear, PUPIL[name] / 2)), 0.0, height, across, down, OBJECT - rear
     )
     assert np.all(weight > 0)
     return np.stack([x + distance * u / w, y + distance * v / w, u, v, length + distance / w])

@@ -44,7 +44,7 @@ def straight(lens: Prescription, height: Any) -> tuple[Array, Array, Any]:
     """Where axial rays from the sensor's side cross the lens's first vertex, their slopes, and whether they pass."""
     height = np.asarray(height, dtype=np.float64)
     rows = path(lens, Disk(lens.rear_principal - float(lens.vertices[-1]), 1.0)).rows[:-1]
-    (x, y), (u, v, w), passed = through(
+    (x, y), (u, v, w), passed, _ = through(
         [*rows, (0.0, 0.0, 1.0, 1.0, 1e30)], (height, 0 * height), (0.0, 0.0, 1.0), NUMPY, True
     )
     assert not np.any(y)
@@ -76,7 +76,7 @@ def test_snell_s_law_holds_at_a_sphere(radius: float, index: float, x: float, y:
     one = lens([radius], [], [index])
     step, *rest = path(one, Disk(0.0, 1.0)).rows[0]
     start = np.array([u, v, 1.0]) / sqrt(u * u + v * v + 1)
-    (a, b), out, passed = through([[0 * step, *rest]], (np.float64(x), np.float64(y)), tuple(start), NUMPY, True)
+    (a, b), out, passed, _ = through([[0 * step, *rest]], (np.float64(x), np.float64(y)), tuple(start), NUMPY, True)
     assert passed
     centre = np.array([0.0, 0.0, -radius])  # the prescription's axis runs to the sensor, the ray's to the target
     point = np.array([a, b, centre[2] + np.sign(radius) * sqrt(radius**2 - a * a - b * b)])
@@ -91,7 +91,7 @@ def test_a_plane_parallel_plate_shifts_a_ray() -> None:
     """By t sin(a) (1 - cos(a) / sqrt(n^2 - sin(a)^2)) across it, and turns it by nothing."""
     angle, thickness, index = np.linspace(-1.4, 1.4, 9), 0.7, 1.6
     planes = [(0.0, 0.0, 1.0, 1 / index, inf), (thickness, 0.0, 1.0, index, inf)]
-    (x, _), (u, _, w), passed = through(
+    (x, _), (u, _, w), passed, _ = through(
         planes, (0 * angle, 0 * angle), (np.sin(angle), 0 * angle, np.cos(angle)), NUMPY, True
     )
     assert np.all(passed)
@@ -104,7 +104,7 @@ def test_total_reflection_and_rims_block_and_leave_numbers() -> None:
     """From glass of index 1.5 nothing leaves beyond asin(1 / 1.5) = 41.8 degrees."""
     angle = np.radians([41.0, 42.0, 80.0])
     for surface in ([0.0, 0.0, 1.0, 1.5, inf], [0.0, 1.0, 1.0, 1.5, inf]):
-        (x, y), direction, passed = through(
+        (x, y), direction, passed, _ = through(
             [surface], (0 * angle, 0 * angle), (np.sin(angle), 0 * angle, np.cos(angle)), NUMPY, True
         )
         assert list(passed) == [True, False, False]
@@ -121,7 +121,7 @@ def test_an_axial_point_and_one_beside_it_have_the_paraxial_images() -> None:
         depth = 1 / (1 / one.focal_length - 1 / distance)
         across, down = 1e-3 * np.array([-1.0, 0.0, 1.0, 0.0]), 1e-3 * np.array([0.0, 1.0, 0.0, 0.0])
         numbers = path(one, Disk(0.0, 1.0))
-        (x, y), (u, v, w), _ = trace(numbers, 1e-4, 0.0, across, down, depth)
+        (x, y), (u, v, w), _, _ = trace(numbers, 1e-4, 0.0, across, down, depth)
         np.testing.assert_allclose(x + distance * u / w, -1e-4 * distance / depth, rtol=1e-4)
         np.testing.assert_allclose(y + distance * v / w, 0, atol=1e-6)
 
@@ -234,7 +234,7 @@ def test_numpy_and_dr_jit_agree_to_float32() -> None:
         numbers = path(one, exit_disk(one, depth, 0.1))
         traced = trace(numbers.converted(mi.Float), rays[0], rays[1], rays[2], rays[3], mi.Float(depth), functions)
         found = np.array([np.array(values) for values in (*traced[0], *traced[1], traced[2])])
-        place, direction, weight = trace(numbers, x, y, across, down, depth)
+        place, direction, weight, _ = trace(numbers, x, y, across, down, depth)
         expected = np.array([*place, *direction, weight])
         edge = (weight > 0) == (found[-1] > 0)  # which float32 may put on the other side of a rim
         assert np.mean(edge) > 0.998
@@ -315,7 +315,7 @@ def test_a_lens_s_rays_are_sharpest_short_of_the_paraxial_focus() -> None:
     assert best["sharpest_axis"] < best["focus"] == pytest.approx(camera.distance)
     kind = camera.types[0]
     one = prescription_of(camera, kind)
-    (x, _), (u, _, w), weight = trace(
+    (x, _), (u, _, w), weight, _ = trace(
         path(one, exit_disk_of(camera, kind, one)), 0.0, 0.0, *spread(4096), camera.depth(kind)
     )
     distances = best["sharpest_axis"] * np.array([0.9, 0.99, 1.0, 1.01, 1.1])

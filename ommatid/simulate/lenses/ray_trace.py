@@ -19,7 +19,7 @@ irradiance of a sensor point before a uniform radiance L is then
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from math import pi
 from typing import Any, NamedTuple
 
@@ -155,15 +155,6 @@ class LensPath(NamedTuple):
         return LensPath(convert(self.height), convert(self.radius), rows)
 
 
-class Step(NamedTuple):
-    """A ray behind one surface: its length up to there since the previous one, its point, direction and fate."""
-
-    run: Any
-    point: Point
-    direction: Direction
-    passed: Any
-
-
 def path(prescription: Prescription, disk: Disk) -> LensPath:
     """Return the numbers of a lens for `trace`."""
     vertices = prescription.front_principal - prescription.vertices[::-1]
@@ -190,67 +181,43 @@ def trace(
     down: Any,
     depth: Any,
     functions: Functions = NUMPY,
-) -> tuple[Point, Direction, Any]:
+) -> tuple[Point, Direction, Any, Any]:
     """Trace the ray from the sensor point (x, y), `depth` behind the rear principal plane, out to the target.
 
     across, down : point of the unit disk through which the ray leaves
 
-    Returns (x, y) where it crosses z = 0, its direction, of length 1 and with z > 0, and its weight: cos^4 of its angle
-    at the sensor, 0 if it is blocked by a rim or by total reflection; then the direction is the axis.
-    """
-    start = _start(numbers, x, y, across, down, depth, functions)
-    point, direction, passed = through(numbers.rows, start.point, start.direction, functions, start.passed)
-    cosine = start.direction[2]
-    return point, direction, functions.where(passed, (cosine * cosine) * (cosine * cosine), 0.0)
-
-
-def trace_path(
-    prescription: Prescription, disk: Disk, x: Any, y: Any, across: Any, down: Any, depth: Any
-) -> tuple[Point, Direction, FloatArray, FloatArray]:
-    """Trace rays as `trace` does, and return also their optical path from the sensor point to z = 0, in mm.
-
+    Returns (x, y) where it crosses z = 0, its direction, of length 1 and with z > 0, its weight, cos^4 of its angle at
+    the sensor, and its optical path from the sensor point to z = 0, in mm. A ray that is blocked by a rim or by total
+    reflection has the weight and the path 0 and the direction of the axis.
     The optical path is the sum of index times length, negative where a ray is followed backwards, such as from the
-    plane of the last surface to the plane of the lenses behind it. It is 0 for a blocked ray. Rays of one sensor point
-    are perpendicular to the surfaces of equal path (Malus and Dupin): its gradient by the point in z = 0 is (u, v).
+    plane of the last surface to the plane of the lenses behind it. Rays of one sensor point are perpendicular to the
+    surfaces of equal path (Malus and Dupin): its gradient by the point in z = 0 is (u, v).
     """
-    numbers = path(prescription, disk)
-    step = _start(numbers, x, y, across, down, depth, NUMPY)
-    cosine, length, index = step.direction[2], step.run, 1.0
-    steps = _steps(numbers.rows, step.point, step.direction, NUMPY, step.passed)
-    for row, step in zip(numbers.rows, steps, strict=True):
-        length = length + index * step.run
-        index = index / row[3]
-    weight = np.where(step.passed, (cosine * cosine) * (cosine * cosine), 0.0)
-    return step.point, step.direction, weight, np.where(step.passed, length, 0.0)
-
-
-def _start(numbers: LensPath, x: Any, y: Any, across: Any, down: Any, depth: Any, functions: Functions) -> Step:
-    """Return the ray from a sensor point in the plane of the disk."""
     along = depth + numbers.height
     at_x, at_y = across * numbers.radius, down * numbers.radius
     u, v = (at_x - x) / along, (at_y - y) / along
     slant = functions.sqrt(1 + u * u + v * v)
     cosine = 1 / slant
-    return Step(along * slant, (at_x, at_y), (u * cosine, v * cosine, cosine), along > 0)
+    start = (at_x, at_y), (u * cosine, v * cosine, cosine)
+    point, direction, passed, length = through(numbers.rows, *start, functions, along > 0, along * slant)
+    weight = functions.where(passed, (cosine * cosine) * (cosine * cosine), 0.0)
+    return point, direction, weight, functions.where(passed, length, 0.0)
 
 
 def through(
-    rows: Sequence[Sequence[Any]], point: Point, direction: Direction, functions: Functions, passed: Any
-) -> tuple[Point, Direction, Any]:
+    rows: Sequence[Sequence[Any]],
+    point: Point,
+    direction: Direction,
+    functions: Functions,
+    passed: Any,
+    length: Any = 0.0,
+) -> tuple[Point, Direction, Any, Any]:
     """Trace a ray that crosses a plane at `point` through surfaces, whose numbers are those of `LensPath.rows`.
 
-    Returns (x, y) in the last plane, the direction of length 1, and True if it got there; else the axis and False.
+    Returns (x, y) in the last plane, the direction of length 1, and True if it got there, else the axis and False; and
+    the optical path, beyond the `length` that the ray begins with.
     """
-    for step in _steps(rows, point, direction, functions, passed):
-        point, direction, passed = step.point, step.direction, step.passed
-    return point, direction, passed
-
-
-def _steps(
-    rows: Sequence[Sequence[Any]], point: Point, direction: Direction, functions: Functions, passed: Any
-) -> Iterator[Step]:
-    """Trace a ray through surfaces, one at a time."""
-    (x, y), z = point, 0.0
+    (x, y), z, index = point, 0.0, 1.0
     for distance, *surface in rows:
         run = (distance - z) / direction[2]
         x, y = x + run * direction[0], y + run * direction[1]
@@ -260,7 +227,9 @@ def _steps(
         else:
             meeting = meet_conic(curvature, shape, x, y, direction, functions, passed)
         (x, y, z), direction, passed = _refract(meeting, ratio, opening, direction, functions)
-        yield Step(run + meeting.run, (x, y), direction, passed)
+        length = length + index * (run + meeting.run)
+        index = index / ratio
+    return (x, y), direction, passed, length
 
 
 def _refract(

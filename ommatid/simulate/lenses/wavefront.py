@@ -26,7 +26,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from .prescription import Prescription
-from .ray_trace import Disk, LensPath, path, spread, trace, trace_path
+from .ray_trace import Disk, LensPath, path, spread, trace
 
 SCOUTS = 4096  # rays that find the middle of the clear part of the disk
 EDGE_STEPS, PARTS = 8, 16  # of the search for the edge, each of which divides an interval into so many parts
@@ -220,7 +220,8 @@ def _traced(pencil: _Pencil, wavelength: float | None, counts: tuple[int, int]) 
     at = (middle[:, None, None] + radius * edge * direction).reshape(2, -1)
     # All nodes are known to pass the rims; the differences may step over these.
     open_lens = replace(prescription, semi_diameter=BESIDE_RIM * prescription.semi_diameter)
-    points, (u, v, w), weights, optical = trace_path(open_lens, disk, 0.0, height, at[0], at[1], depth)
+    numbers = path(open_lens, disk)
+    points, (u, v, w), weights, optical = trace(numbers, 0.0, height, at[0], at[1], depth)
     slopes = np.stack([u / w, v / w])
     hits = np.stack(points) + distance * slopes
     before = _pupil_plane(prescription, distance)
@@ -239,7 +240,7 @@ def _traced(pencil: _Pencil, wavelength: float | None, counts: tuple[int, int]) 
     density = np.zeros(0)
     if wavelength is not None:
         steps = STEP * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[..., None]
-        moved = lines(*_rays(path(open_lens, disk), height, at + steps, depth))[0]
+        moved = lines(*_rays(numbers, height, at + steps, depth))[0]
         right, up = (moved[:, 0] - moved[:, 1]) / (2 * STEP), (moved[:, 2] - moved[:, 3]) / (2 * STEP)
         density = np.abs(right[0] * up[1] - right[1] * up[0]) * (area * edge**2).ravel()
     optical = optical + before * np.sqrt(1 + np.square(slopes).sum(axis=0)) + length
@@ -267,7 +268,7 @@ def _pupil_plane(prescription: Prescription, distance: float) -> float:
 
 def _rays(numbers: LensPath, height: float, at: FloatArray, depth: float) -> tuple[FloatArray, FloatArray]:
     """Trace rays through points of the disk, (k, 2, n): points and slopes, (2, k, n)."""
-    (x, y), (u, v, w), _ = trace(numbers, 0.0, height, at[:, 0], at[:, 1], depth)
+    (x, y), (u, v, w), _, _ = trace(numbers, 0.0, height, at[:, 0], at[:, 1], depth)
     return np.stack([x, y]), np.stack([u / w, v / w])
 
 

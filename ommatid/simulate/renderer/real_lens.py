@@ -56,7 +56,7 @@ class RealLens(LensModel):
 
         del lens
         on_disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
-        (at_x, at_y), direction, weight = trace(self._numbers, x, y, on_disk.x, on_disk.y, depth, self._functions)
+        (at_x, at_y), direction, weight, _ = trace(self._numbers, x, y, on_disk.x, on_disk.y, depth, self._functions)
         return (at_x, at_y, 0), direction, weight
 
 

@@ -25,7 +25,7 @@ from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby
 from math import ceil, exp, inf
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,7 +39,6 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import posterior_variances
 
-from .renderer.renderer import Renderer
 from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint, State
 from .sampling.passes import (
@@ -57,6 +56,9 @@ from .sampling.passes import (
 )
 from .sampling.sample_law import LEAPS, SampleLaw
 from .world_view import rendered_world
+
+if TYPE_CHECKING:
+    from .renderer.renderer import Renderer
 
 DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, and what a round is planned for
 LEAST = 256  # samples per pixel of a first round, at least
@@ -90,7 +92,9 @@ def render_until(
     adds no noise, or if the requested variant does not work here.
     """
     scene = setup.scene
-    allowed, variant = allowed_variance(setup), choose(scene.render.variant)
+    allowed, variant = allowed_variance(setup), choose(scene.render.variant)  # before Mitsuba is loaded
+    from .renderer.renderer import Renderer
+
     renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     rounds = AdaptiveRounds(setup, renderer, allowed)

@@ -50,10 +50,10 @@ def truth(setup: Setup) -> Truth:
 
     Raises InputError for a world that cannot be built, or a variant that does not work here.
     """
+    scene, camera = setup.scene, setup.camera
+    variant, work = choose(scene.render.variant), _plan(setup)  # before Mitsuba is loaded
     from .renderer.renderer import Renderer
 
-    scene, camera = setup.scene, setup.camera
-    variant, work = choose(scene.render.variant), _plan(setup)
     renderer = Renderer(ideal_camera(camera).world, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     seeds = [sampler_seeds(scene.render.seed, "truth", number, work.passes + 1) for number in range(work.passes + 1)]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
@@ -29,12 +29,14 @@ from ommatid.scenes.shrinkage import posterior_variances_among
 from ommatid.scenes.stack import STRAIGHT, Stack, stack_from_recording
 from ommatid.scenes.tables.sensor import SensorTable
 
-from .renderer.rays import Pixels
-from .renderer.renderer import Renderer
 from .renderer.variant import choose, release
 from .sampling.checkpoint import Checkpoint, State, open_checkpoint
 from .sampling.passes import OverPasses, Plan, Rendering, Tally, plan, rounding_variance
 from .world_view import rendered_world
+
+if TYPE_CHECKING:
+    from .renderer.rays import Pixels
+    from .renderer.renderer import Renderer
 
 NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle
 BAND = 2**22  # sensor pixels, at most, unless rays that start together are of more
@@ -95,12 +97,12 @@ def light(
     work : passes and their samples; None: as the scene's `render.samples` asks
     Raises InputError if the requested variant does not work here, ValueError if the samples are "auto".
     """
-    from .renderer.renderer import Renderer
-
     scene = setup.scene
     if scene.render.samples == "auto":
         raise ValueError("expected a number of samples, got 'auto', which `render_until` renders")
-    variant = choose(scene.render.variant)
+    variant = choose(scene.render.variant)  # before Mitsuba is loaded
+    from .renderer.renderer import Renderer
+
     work = plan(scene.render.samples, scene.render.sampler) if work is None else work
     renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
@@ -196,7 +198,8 @@ def render_bands(
 
 def bands_of(renderer: Renderer, samples: int) -> list[list[Pixels]]:
     """Join the adjacent blocks of pixels whose rays start together to bands."""
-    bands, size = list[list[Pixels]](), 0
+    bands: list[list[Pixels]] = []
+    size = 0
     for block in (block for group in renderer.groups for block in renderer.blocks(renderer.pixels(group), samples)):
         if not bands or size + block.count > BAND:
             bands.append([])

@@ -93,12 +93,13 @@ _known: dict[str, WorldView] = {}
 
 def world_view(setup: Setup) -> WorldView:
     """Look at the world of a scene; computed once per process. Raises InputError for one that cannot be built."""
-    from .renderer.renderer import Renderer
     from .renderer.world import describe, world_of
     from .renderer.worlds.building import box_of, depths_met, has_surroundings
 
     scene, camera, table = setup.scene, setup.camera, world_of(setup.scene)
-    variant = choose(scene.render.variant)
+    variant = choose(scene.render.variant)  # before Mitsuba is loaded
+    from .renderer.renderer import Renderer
+
     key = fingerprint([describe(scene), camera.describe(), scene.render.model_dump(mode="json"), variant])
     if key in _known:
         return _known[key]

@@ -48,9 +48,9 @@ def measured(
     subsets : lens types, and their pixels, that are measured; rows of H of all others are empty; None: all
     Raises InputError if rays are asked for and only Mitsuba's scalar backend works, MachineError for wrong rows.
     """
+    scene, variant, seed = setup.scene, choose(setup.scene.render.variant), setup.scene.render.seed
     from ..renderer.renderer import Renderer
 
-    scene, variant, seed = setup.scene, choose(setup.scene.render.variant), setup.scene.render.seed
     renderer = Renderer(setup.simulated, variant, scene.render.sampler, together=False)  # types are measured apart
     plans = same_plans(setup) if plans is None else plans
     chosen: Subsets = dict.fromkeys(renderer.groups) if subsets is None else subsets

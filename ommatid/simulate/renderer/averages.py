@@ -20,15 +20,14 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 
+from .loaded import dr, mi
+
 
 class Averages:
     """A picture's averages and first moments over the boxes of a lens type; dark beside the target."""
 
     def __init__(self, camera: Camera, lens_type: LensType, picture: FloatArray) -> None:
         """Average a picture, (rows, columns), in the units of radiance."""
-        import drjit as dr
-        import mitsuba as mi
-
         self._camera = camera
         self._boxes, self._parts = zip(*(side.as_integer_ratio() for side in lens_type.footprint), strict=True)
         fine: FloatArray = np.repeat(np.repeat(picture, self._parts[0], axis=0), self._parts[1], axis=1)
@@ -50,8 +49,6 @@ class Averages:
         falloff : relative change of the light's weight across a pixel, down and across, of each ray
         moved : displacement of the boxes, down and across, in parts of a pixel of the picture
         """
-        import mitsuba as mi
-
         camera, along = self._camera, (self._camera.distance - ray.o.z) / ray.d.z
         middle = [camera.rows / 2 - (ray.o.y + along * ray.d.y) / camera.target_pitch]
         middle.append(camera.columns / 2 - (ray.o.x + along * ray.d.x) / camera.target_pitch)

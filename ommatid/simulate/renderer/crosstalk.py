@@ -16,6 +16,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.pose import poses
 
 from .lens import Distance, Emission, LensModel, Point
+from .loaded import dr, mi
 
 OWN = 0.5  # of a pixel's rays, through its own lens
 
@@ -25,8 +26,6 @@ class Crosstalk:
 
     def __init__(self, camera: Camera, models: Mapping[str, LensModel]) -> None:
         """Load the places of all lenses; `models` are those of the lens types, by name."""
-        import mitsuba as mi
-
         names = list(models)
         self._models = [models[name] for name in names]
         self._others = len(camera.sub_imagers) - 1
@@ -48,9 +47,6 @@ class Crosstalk:
         own : number of that lens in the camera, which is at `lens`
         point : x, y from its centre, and depth behind the lenses
         """
-        import drjit as dr
-        import mitsuba as mi
-
         drawn = sampler.next_1d()
         through_other = drawn >= OWN
         number = mi.UInt32((drawn - OWN) / (1 - OWN) * self._others)
@@ -71,8 +67,6 @@ class Crosstalk:
 
     def _through(self, kind: Any, point: tuple[Any, Any, Any], sampler: Any, lens: Point) -> Emission:
         """Return the rays through lenses of the given types, relative to their centres."""
-        import drjit as dr
-
         start, direction, weight = self._models[0].emit(*point, sampler, lens)
         for number, model in enumerate(self._models[1:], 1):
             other = model.emit(*point, sampler, lens)

@@ -25,6 +25,7 @@ from ommatid.scenes.optics.diffraction import QUANTILES, pattern
 
 from ..lenses.ray_trace import reach
 from .lens import Distance, Emission, LensModel, Point, falloff, through_thin_lens
+from .loaded import dr, mi
 
 FEW_QUANTILES = 2**12  # where the defocus varies
 STEP, GROWTH, LINEAR = 0.05, 1.02, 3.0  # between tabulated defoci, in waves: up to LINEAR, and as a factor beyond
@@ -43,8 +44,6 @@ class DiffractingLens(LensModel):
     def __init__(self, camera: Camera, lens_type: LensType, aperture: float) -> None:
         """Create the model of a lens type with an aperture of this diameter."""
         super().__init__(camera, lens_type)
-        import mitsuba as mi
-
         self.distance: Distance | None = None
         self._camera, self._type, self._aperture = camera, lens_type, aperture
         self._depth, self._focus = camera.depth(lens_type), camera.focus(lens_type)
@@ -77,8 +76,6 @@ class DiffractingLens(LensModel):
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
-        import drjit as dr
-
         sample = sampler.next_2d()
         band, share, light = self._band(sampler), sample.x, falloff(x, y, 0.0, 0.0, depth)
         if self.spreads and self.captured < 1:  # the light beyond a ring falls as 1 / radius: as many rays to each
@@ -102,9 +99,6 @@ class DiffractingLens(LensModel):
 
     def _band(self, sampler: Any) -> list[Any]:
         """Draw the band of each ray: a mask for each band."""
-        import drjit as dr
-        import mitsuba as mi
-
         if len(self._bands) == 1:
             return [True]
         drawn, index = sampler.next_1d(), mi.UInt32(0)
@@ -114,8 +108,6 @@ class DiffractingLens(LensModel):
 
     def _displaced(self, chief: Point, vergence: Any, beam: Beam, band: list[Any]) -> tuple[Point, Any]:
         """Return the slopes, from the lens's centre, to the points that rays meet, and their relative weights."""
-        import drjit as dr
-
         along: Any = 0.0
         slant: Any = 1.0
         for (wavelength, _), table, mask in zip(self._bands, self._tables, band, strict=True):
@@ -142,8 +134,6 @@ class BandTable:
 
     def __init__(self, ends: FloatArray, weight: float, steps: int) -> None:
         """Tabulate the patterns between the least and the largest of some defoci, in waves, in so many steps."""
-        import mitsuba as mi
-
         low, high = (0.0, np.abs(ends).max()) if ends.min() < 0 < ends.max() else np.sort(np.abs(ends))
         limited = min(low, MOST_TABULATED / GROWTH), min(high, MOST_TABULATED)
         self._nodes = _nodes(*limited) if high - low >= SAME else np.array([(low + high) / 2])
@@ -157,8 +147,6 @@ class BandTable:
 
         Beyond the last defocus the radii grow as those of the disk of rays, beyond the table's as those of its tail.
         """
-        import drjit as dr
-
         if not all_light:
             return self._inside(waves, share)
         v, slant = self._inside(waves, dr.minimum(share / self.captured, 1.0))
@@ -166,9 +154,6 @@ class BandTable:
         return v * dr.maximum(rest, 1.0), slant
 
     def _inside(self, waves: Any, share: Any) -> tuple[Any, Any]:
-        import drjit as dr
-        import mitsuba as mi
-
         position = dr.sqrt(share) * self._steps
         cell = dr.minimum(mi.UInt32(position), self._steps - 1)
         inside = position - mi.Float(cell)
@@ -187,9 +172,6 @@ class BandTable:
 
     @staticmethod
     def _between(table: Any, row: Any, share: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         return dr.lerp(dr.gather(mi.Float, table, row), dr.gather(mi.Float, table, row + 1), share)
 
 

@@ -30,6 +30,8 @@ from numpy.typing import NDArray
 from ommatid.runtime.arrays import IntArray
 from ommatid.runtime.streams import draw_seed
 
+from .loaded import dr, mi
+
 DIMENSIONS = 8  # of the points; what a ray draws beyond them is independent
 BITS = 32
 FACTORS = 0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6
@@ -94,21 +96,14 @@ class SobolDraws:
 
     def position(self) -> Any:
         """Return the point of the pixel's open part where every ray starts."""
-        import mitsuba as mi
-
         return mi.Point2f(0.5) if self.spreads else self.next_2d()
 
     def next_2d(self) -> Any:
         """Draw two numbers for every ray."""
-        import mitsuba as mi
-
         return mi.Point2f(self.next_1d(), self.next_1d())
 
     def next_1d(self) -> Any:
         """Draw a number for every ray."""
-        import drjit as dr
-        import mitsuba as mi
-
         dimension, self._dimension = self._dimension, self._dimension + 1
         lane: Any = dr.arange(mi.UInt32, self._lanes)
         stream = lane // dr.opaque(mi.UInt32, self._samples)
@@ -152,9 +147,6 @@ class GridDraws:
 
     def position(self) -> Any:
         """Return the point of the pixel's open part where every ray starts: the cells of a pixel by rows."""
-        import drjit as dr
-        import mitsuba as mi
-
         pixels, passes = self._keys.shape
         lane: Any = dr.arange(mi.UInt32, pixels * passes * self._cells**2)
         of_pass = lane // dr.opaque(mi.UInt32, self._cells**2)

@@ -18,6 +18,8 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.pose import poses
 
+from .loaded import dr, mi
+
 Point = tuple[Any, Any]
 Distance = Callable[[Any, Any], Any]  # along z to the first surface that rays meet, by their origins and directions
 Emission = tuple[tuple[Any, Any, Any], tuple[Any, Any, Any], Any]
@@ -94,16 +96,11 @@ class ThinLens(LensModel):
     def __init__(self, camera: Camera, lens_type: LensType, aperture: float) -> None:
         """Create the model of a lens type with an aperture of this diameter."""
         super().__init__(camera, lens_type)
-        import drjit as dr
-        import mitsuba as mi
-
         self._radius = dr.opaque(mi.Float, aperture / 2)
         self._focal = dr.opaque(mi.Float, camera.focal_length(lens_type))
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
-        import mitsuba as mi
-
         del lens
         on_disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d()) * self._radius
         weight = falloff(x, y, on_disk.x, on_disk.y, depth)

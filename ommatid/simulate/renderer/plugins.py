@@ -22,6 +22,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import Sampler
 
 from ..sampling.samplers import fitting
+from .loaded import mi
 from .variant import activate
 from .worlds.building import BLOCK
 from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
@@ -34,8 +35,6 @@ def scene_of(target: dict[str, Any]) -> dict[str, Any]:
 
 def target_of(camera: Camera, texture: dict[str, Any]) -> dict[str, Any]:
     """Return the emissive rectangle of the target, which shows its picture upright, one texel per pixel of f."""
-    import mitsuba as mi
-
     half = [camera.columns * camera.target_pitch / 2, camera.rows * camera.target_pitch / 2, 1.0]
     to_world = mi.ScalarTransform4f().translate([0, 0, camera.distance]).rotate([0, 1, 0], 180).scale(half)
     return {"type": "rectangle", "to_world": to_world, "emitter": {"type": "area", "radiance": texture}}
@@ -54,8 +53,6 @@ def stock_sensor(
 
     far : of the far clipping plane, in distances of the target;  placement : of the camera in a world
     """
-    import mitsuba as mi
-
     rows, columns = sub.type.pixels
     width = float(sub.type.ratio) * columns * camera.target_pitch
     height = float(sub.type.ratio) * rows * camera.target_pitch
@@ -78,8 +75,6 @@ def stock_sensor(
 
 def stock_sensors(camera: Camera, sampler: Sampler, channels: int, far: float, placement: Placement) -> list[Any]:
     """Create Mitsuba's sensors of all sub-imagers, in their order in the camera."""
-    import mitsuba as mi
-
     subs = camera.sub_imagers
     return [mi.load_dict(stock_sensor(camera, sub, sampler, 16, channels, far, placement)) for sub in subs]
 
@@ -98,16 +93,12 @@ def film(width: int, height: int, channels: int = 1) -> dict[str, Any]:
 
 def black(camera: Camera, channels: int) -> dict[str, Any]:
     """Return a black picture on the target."""
-    import mitsuba as mi
-
     texels = np.zeros((camera.rows, camera.columns, channels), dtype=np.float32)
     return texture_of({"bitmap": mi.Bitmap(texels)})
 
 
 def texture_of(source: dict[str, Any]) -> dict[str, Any]:
     """Return a texture of unmodified texels: upright, not filtered, not wrapped, not read as sRGB."""
-    import mitsuba as mi
-
     upright = mi.ScalarTransform3f().translate([0, 1]).scale([1, -1])  # row 0 would lie at v = 0, the bottom
     return {
         "type": "bitmap",
@@ -125,8 +116,6 @@ def depths(scene: Any, pinhole: Camera, seed: int, far: float, placement: Placem
     Infinite where it sees no surface. Transparent surfaces count like any other.
     far : of the far clipping plane, in distances of the target;  placement : of the camera in the scene
     """
-    import mitsuba as mi
-
     (sub,) = pinhole.sub_imagers
     sensor = mi.load_dict(stock_sensor(pinhole, sub, "independent", 1, far=far, placement=placement))
     channels = mi.load_dict({"type": "aov", "aovs": "place:position,far:depth", "block_size": BLOCK})
@@ -151,8 +140,6 @@ def export(setup: Setup, path: Path) -> Path:
     if path.suffix != ".xml":
         raise InputError(f"{path}: expected the name of a Mitsuba scene, ending in .xml")
     activate("scalar_rgb")
-    import mitsuba as mi
-
     picture = path.with_name(f"{path.stem}.target.exr")
     write_truth(picture, setup.world.image)
     plugins = scene_of(target_of(camera, texture_of({"filename": picture.name})))

@@ -26,6 +26,7 @@ from ..sampling.passes import Plan
 from ..sampling.samplers import RELATED_DRAWS, fitting
 from .draws import GridDraws, ReseededSampler
 from .lens import Distance, LensModel, ThinLens
+from .loaded import dr, mi
 from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each
@@ -75,9 +76,6 @@ class Rays:
 
     def sums(self, *values: Any) -> tuple[FloatArray, ...]:
         """Return the sums of values per ray over each pixel, (pixels,) each, computed together."""
-        import drjit as dr
-        import mitsuba as mi
-
         lanes = [mi.Float64(value) for value in values]
         dr.eval(lanes)
         return tuple(np.array(dr.block_sum(lane, self.samples)) for lane in lanes)
@@ -91,8 +89,6 @@ class RayGenerator:
 
         has_world : True if the sampler is also used for what the rays meet
         """
-        import mitsuba as mi
-
         self._sampler_name: Sampler = sampler
         self._has_world = has_world
         self.sampler: Any = mi.load_dict({"type": sampler, "sample_count": fitting(sampler, 16)})
@@ -145,9 +141,6 @@ class RayGenerator:
 
     def falloff(self, pixels: Pixels, work: Plan) -> tuple[Any, Any]:
         """Return the relative change of each ray's weight across its pixel's open part, down and across."""
-        import drjit as dr
-        import mitsuba as mi
-
         index = dr.arange(mi.UInt32, pixels.count * work.total) // dr.opaque(mi.UInt32, work.total)
         x, y, z = (dr.gather(mi.Float, row, index) for row in self._load(pixels)[0][:3])
         x, y = x + self._pitch / 2, y + self._pitch / 2
@@ -156,8 +149,6 @@ class RayGenerator:
 
     def _load(self, pixels: Pixels) -> tuple[list[Any], Any]:
         """Load the places of pixels: coordinates and axes, and the number of each pixel's lens."""
-        import mitsuba as mi
-
         if self._loaded is None or self._loaded[0] is not pixels:
             numbers = pixels.numbers
             coordinates = [mi.Float(np.ascontiguousarray(row, dtype=np.float32)) for row in self._places.at(numbers)]
@@ -166,9 +157,6 @@ class RayGenerator:
 
     def rays(self, pixels: Pixels, work: Plan, draws: Any) -> Rays:
         """Start the rays of some pixels; the passes of one pixel, and the samples of one pass, are adjacent."""
-        import drjit as dr
-        import mitsuba as mi
-
         coordinates, own = self._load(pixels)
         lanes = pixels.count * work.total
         index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, work.total)

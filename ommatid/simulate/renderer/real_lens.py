@@ -22,6 +22,7 @@ from ..lenses.prescription import prescription_of
 from ..lenses.ray_trace import Functions, exit_disk_of, path, reach, trace
 from ..lenses.wavefront import GRID_REACH
 from .lens import Distance, Emission, LensModel, Point
+from .loaded import dr, mi
 
 HEIGHTS = 257  # off the axis, between which the middle and the amount of the light are interpolated linearly
 CELLS, FEW = 8, 4  # of the grid that slopes are drawn from, per wavelength times f-number; where defocus varies
@@ -42,9 +43,6 @@ class RealLens(LensModel):
     def __init__(self, camera: Camera, lens_type: LensType) -> None:
         """Create the model of a lens type with surfaces. Raises InputError if these form no image or pass no light."""
         super().__init__(camera, lens_type)
-        import drjit as dr
-        import mitsuba as mi
-
         lens = prescription_of(camera, lens_type)
         numbers = path(lens, exit_disk_of(camera, lens_type, lens))
         self._numbers = numbers.converted(lambda number: dr.opaque(mi.Float, float(number)))
@@ -52,8 +50,6 @@ class RealLens(LensModel):
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
-        import mitsuba as mi
-
         del lens
         on_disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
         (at_x, at_y), direction, weight, _ = trace(self._numbers, x, y, on_disk.x, on_disk.y, depth, self._functions)
@@ -91,8 +87,6 @@ class WaveLens(RealLens):
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
-        import drjit as dr
-
         sample = sampler.next_2d()
         band = self._bands[0] if len(self._bands) == 1 else None
         drawn, vergence, ray = 0.0 if band else sampler.next_1d(), self._vergence, None
@@ -118,8 +112,6 @@ class WaveLens(RealLens):
 
     def _met(self, distance: Distance, ray: Emission, x: Any, y: Any, depth: Any, lens: Point) -> Any:
         """Return 1 over the distance that a ray goes, or the ray through the middle of the lens if it is blocked."""
-        import drjit as dr
-
         (at_x, at_y, _), direction, weight = ray
         passed = weight > 0
         start = lens[0] + dr.select(passed, at_x, 0.0), lens[1] + dr.select(passed, at_y, 0.0), 0
@@ -132,8 +124,6 @@ class _Band:
 
     def __init__(self, field: SurfaceField, share: float, ends: list[float], cells: int, beyond: float) -> None:
         """Tabulate the slopes between two vergences of the target, or at one if these are the same."""
-        import mitsuba as mi
-
         self.share, self.ends, self._last = share, ends, field.field
         heights = np.linspace(0.0, field.field, HEIGHTS)
         # The ratio of heights on the target and on the sensor; that on the axis is the limit.
@@ -154,15 +144,11 @@ class _Band:
 
     def chief(self, x: Any, y: Any, nearer: Any) -> tuple[Any, Any]:
         """Return the mean slopes of the light of a sensor point whose depth is the designed one over `nearer`."""
-        import drjit as dr
-
         scale = self._interpolated(self._scale, dr.sqrt(x * x + y * y)) * nearer
         return x * scale, y * scale
 
     def emit(self, x: Any, y: Any, nearer: Any, vergence: Any, sample: Any, all_light: bool) -> tuple[Any, Any, Any]:
         """Return the slopes of a ray and its weight; `all_light` is False for the light within the table alone."""
-        import drjit as dr
-
         height, (across, up) = dr.sqrt(x * x + y * y), self.chief(x, y, nearer)
         at = [dr.minimum(height, self._last)]
         share = self.captured if all_light else 1.0
@@ -179,9 +165,6 @@ class _Band:
         return across + along * sine + beside * cosine, up + along * cosine - beside * sine, weight
 
     def _interpolated(self, table: Any, height: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         position = dr.minimum(height / self._last, 1.0) * (HEIGHTS - 1)
         lower = dr.minimum(mi.UInt32(position), HEIGHTS - 2)
         low, high = (dr.gather(mi.Float, table, index) for index in (lower, lower + 1))
@@ -189,8 +172,6 @@ class _Band:
 
 
 def _table(values: FloatArray) -> Any:
-    import mitsuba as mi
-
     return mi.Float(values.astype(np.float32))
 
 

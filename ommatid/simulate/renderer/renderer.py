@@ -29,6 +29,7 @@ from ..sampling.passes import Plan, has_equal_boxes, margin
 from ..sampling.samplers import fitting
 from .averages import Averages
 from .draws import SobolDraws
+from .loaded import dr, mi
 from .plugins import black, depths, scene_of, stock_sensors, target_of
 from .rays import Pixels, RayGenerator, Rays, Seed
 from .variant import activate, check_fast_variant, ignored_samples
@@ -74,8 +75,6 @@ class Renderer:
         """
         check_fast_variant(camera, variant)
         activate(variant)
-        import mitsuba as mi
-
         self._sampler: Sampler = sampler
         self.camera = camera
         self.is_fast = fast = not variant.startswith("scalar")
@@ -118,8 +117,6 @@ class Renderer:
 
         Signed values are allowed.
         """
-        import mitsuba as mi
-
         if not self._texels:
             return
         self._picture, self._averages = (images[0] if self._texture is not None else None), {}
@@ -169,8 +166,6 @@ class Renderer:
 
     def _films(self, pixels: Pixels, samples: int, seeds: Sequence[Seed]) -> FloatArray:
         """Render the sub-imagers of pixels by stock sensors: (channels, passes, pixels)."""
-        import mitsuba as mi
-
         rows = pixels.numbers + self.rows(pixels.group).start
         parts: list[FloatArray] = []
         for index, own in enumerate(self.camera.slices()):
@@ -208,8 +203,6 @@ class Renderer:
 
     def _light(self, group: str, rays: Rays) -> Any:
         """Return the radiance that each ray meets."""
-        import mitsuba as mi
-
         if self._texture is None:
             return self._integrator.sample(self._scene, self._generators[group].sampler, rays.ray, None, True)[0].x
         # What the integrator yields, in a third of the time.
@@ -243,8 +236,6 @@ class Renderer:
 
         The rays are those of `expose` with the same samples and seed; all start together. Only on the fast backends.
         """
-        import drjit as dr
-
         if self.camera.unknowns >= MOST_TEXELS:
             raise InputError(
                 f"expected a target of fewer than 2^24 pixels, got {self.camera.unknowns}; make it smaller"

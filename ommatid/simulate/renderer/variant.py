@@ -86,7 +86,7 @@ def unusable_reason(variant: str) -> str:
     Raises MachineError if Mitsuba cannot be loaded at all.
     """
     try:
-        with _without_complaints():
+        with without_complaints():
             import drjit as dr
     except (ImportError, NameError) as error:  # NameError: Dr.Jit's, of a system library that it does not find
         reason = printable(str(error.__context__ or error))
@@ -111,7 +111,7 @@ def unusable_reason(variant: str) -> str:
 
 
 @contextmanager
-def _without_complaints() -> Generator[None]:
+def without_complaints() -> Generator[None]:
     """Leave out what Dr.Jit prints to the error stream about LLVM while it is loaded, and pass on all other lines."""
     if "drjit" in sys.modules:
         yield
@@ -158,7 +158,7 @@ def check_transport_variant(variant: str, key: str = "calibration.method") -> No
 
 def activate(variant: str) -> None:
     """Make a variant Mitsuba's current one, and pass its warnings to Python's log."""
-    with _without_complaints():
+    with without_complaints():
         import mitsuba as mi
 
     fix_plugin_folder()

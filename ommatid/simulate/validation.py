@@ -10,9 +10,14 @@ from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import DEVIATIONS
 from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.optics.blur import blur_of
+from ommatid.scenes.optics.distortion import field
+from ommatid.scenes.pose import poses
 from ommatid.scenes.setup import Setup
 
 from .adaptive_render import check_noise_target
+from .lenses.prescription import prescription_of
+from .lenses.wavefront import GRID_REACH
 from .renderer.variant import check_fast_variant, check_transport_variant, choose
 from .world_view import check_world
 
@@ -55,13 +60,8 @@ def check_lenses(camera: Camera) -> None:
     """Raise InputError for surfaces that form no image, and for distortion that folds the image."""
     for lens_type in camera.types:
         if lens_type.optics.surfaces is not None:
-            from .lenses.prescription import prescription_of
-
             prescription_of(camera, lens_type)
         if lens_type.optics.distortion is not None:
-            from ommatid.scenes.optics.distortion import field
-            from ommatid.scenes.pose import poses
-
             for sub, pose in zip(camera.sub_imagers, poses(camera), strict=True):
                 if sub.type == lens_type:
                     field(camera, sub, pose)
@@ -87,17 +87,12 @@ def _visible_pixels(camera: Camera, lens_type: LensType) -> int:
     if lens_type.optics.surfaces is not None:
         side += 2 * ceil(_diffraction_reach(camera, lens_type) + DEVIATIONS * camera.diffusion(lens_type))
     elif camera.is_blurred(lens_type):
-        from ommatid.scenes.optics.blur import blur_of
-
         side += 2 * ceil(blur_of(camera, lens_type).reach)
     return side**2
 
 
 def _diffraction_reach(camera: Camera, lens_type: LensType) -> float:
     """How far, in pixels of f, the point-spread function of surfaces is computed in focus."""
-    from .lenses.prescription import prescription_of
-    from .lenses.wavefront import GRID_REACH
-
     depth = camera.depth(lens_type)
     working = prescription_of(camera, lens_type).working_f_number(depth)
     return (

@@ -16,6 +16,7 @@ from typing import Any
 
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.optics.distortion import field, undistort
 from ommatid.scenes.pose import poses
 
 from .loaded import dr, mi
@@ -61,8 +62,6 @@ class LensModel:
         self._distortion = lens_type.optics.distortion
         self._corner = camera.distance_of(lens_type) / camera.half_diagonal
         if self._distortion is not None:
-            from ommatid.scenes.optics.distortion import field
-
             pairs = zip(camera.sub_imagers, poses(camera), strict=True)
             self._limit = max(field(camera, sub, pose) for sub, pose in pairs if sub.type == lens_type)
 
@@ -83,8 +82,6 @@ class LensModel:
         slopes = through_centre(x, y, depth)
         if self._distortion is None:
             return slopes
-        from ommatid.scenes.optics.distortion import undistort
-
         return undistort(*slopes, *self._distortion, self._corner, self._limit)
 
 

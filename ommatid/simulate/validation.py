@@ -11,8 +11,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import DEVIATIONS
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.blur import blur_of
-from ommatid.scenes.optics.distortion import field
-from ommatid.scenes.pose import poses
+from ommatid.scenes.optics.distortion import largest_field
 from ommatid.scenes.setup import Setup
 
 from .adaptive_render import check_noise_target
@@ -62,9 +61,7 @@ def check_lenses(camera: Camera) -> None:
         if lens_type.optics.surfaces is not None:
             prescription_of(camera, lens_type)
         if lens_type.optics.distortion is not None:
-            for sub, pose in zip(camera.sub_imagers, poses(camera), strict=True):
-                if sub.type == lens_type:
-                    field(camera, sub, pose)
+            largest_field(camera, lens_type)
 
 
 def check_entries(setup: Setup, types: Iterable[LensType], why: str = "") -> None:

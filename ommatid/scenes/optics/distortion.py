@@ -17,8 +17,8 @@ import numpy as np
 from ommatid.runtime.errors import InputError
 
 from ..camera import Camera
-from ..lens_type import SubImager
-from ..pose import Pose
+from ..lens_type import LensType, SubImager
+from ..pose import Pose, poses
 
 ITERATIONS = 10  # for |k1|, |k2| up to 0.3 and r up to 1.5, 7 are enough for float64 and 5 for float32
 LARGEST_ERROR = 1e-9  # of undistort in r, times the derivative
@@ -75,6 +75,12 @@ def field(camera: Camera, sub: SubImager, pose: Pose) -> float:
                 f" r = {limit:.3g} for {sub.name}; use smaller k1 and k2"
             )
     return limit
+
+
+def largest_field(camera: Camera, lens_type: LensType) -> float:
+    """Largest r of the target around the axes of a lens type's sub-imagers. Raises as `field` does."""
+    pairs = zip(camera.sub_imagers, poses(camera), strict=True)
+    return max(field(camera, sub, pose) for sub, pose in pairs if sub.type == lens_type)
 
 
 def _fault(k1: float, k2: float, limit: float) -> str:

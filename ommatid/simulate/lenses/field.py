@@ -42,12 +42,17 @@ class LensField(ABC):
 
     distance : of the target from the front principal plane;  depth : of the sensor behind the rear one
     field : the largest height of a sensor point
+    entrance_pupil : its diameter, and how far it is before the front principal plane
+    working_f_number : ratio of length to width of the cone of light at the sensor
     """
 
     depth: float
     distance: float
     field: float
     wavelength: float | None
+    focal_length: float
+    entrance_pupil: tuple[float, float]
+    working_f_number: float
 
     @abstractmethod
     def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
@@ -55,21 +60,6 @@ class LensField(ABC):
 
         half : of the width of the grid that the wave's nodes serve, where it is wider than that of its own
         """
-
-    @property
-    @abstractmethod
-    def focal_length(self) -> float:
-        """The focal length."""
-
-    @property
-    @abstractmethod
-    def entrance_pupil(self) -> tuple[float, float]:
-        """Diameter of the entrance pupil, and how far it is before the front principal plane."""
-
-    @property
-    @abstractmethod
-    def working_f_number(self) -> float:
-        """Ratio of length to width of the cone of light at the sensor."""
 
     @cached_property
     def _rays(self) -> tuple[FloatArray, list[Wavefront]]:
@@ -218,22 +208,6 @@ class SurfaceField(LensField):
         """Trace the wave through the surfaces; see `LensField.wave`."""
         return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, half)
 
-    @property
-    def focal_length(self) -> float:
-        """The focal length."""
-        return self.prescription.focal_length
-
-    @property
-    def entrance_pupil(self) -> tuple[float, float]:
-        """Diameter of the entrance pupil, and how far it is before the front principal plane."""
-        pupil = self.prescription.entrance_pupil
-        return 2 * pupil.radius, self.prescription.front_principal - pupil.position
-
-    @property
-    def working_f_number(self) -> float:
-        """Ratio of length to width of the cone of light at the sensor."""
-        return self.prescription.working_f_number(self.depth)
-
     def lit_share(self, height: FloatArray) -> FloatArray:
         """Return the mean weight of rays that leave evenly spread over the exit disk, as `trace` gives it."""
         return self.brightness(height) / (pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2)
@@ -249,21 +223,6 @@ class ThinField(LensField):
     def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
         """Compute the wave, whose phase is quadratic; see `LensField.wave`."""
         return thin_wavefront(self.aperture, self.depth, height, self.distance, self.focus, wavelength, half)
-
-    @property
-    def focal_length(self) -> float:
-        """The focal length."""
-        return 1 / (1 / self.depth + 1 / self.focus)
-
-    @property
-    def entrance_pupil(self) -> tuple[float, float]:
-        """Diameter of the lens, and 0."""
-        return self.aperture, 0.0
-
-    @property
-    def working_f_number(self) -> float:
-        """Ratio of length to width of the cone of light at the sensor."""
-        return self.depth / self.aperture
 
 
 def _lit(wave: Wavefront | None, height: float) -> Wavefront:
@@ -335,9 +294,17 @@ def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> L
         return surface_field(camera, lens_type, wavelength)
     if lens_type.optics.aperture is None:
         raise ValueError(f"lens type '{lens_type.name}' is a pinhole, expected a lens")
-    depth, (far, _, _) = camera.depth(lens_type), reach(camera, lens_type)
+    depth, (far, _, _), aperture = camera.depth(lens_type), reach(camera, lens_type), lens_type.optics.aperture
     return ThinField(
-        depth, camera.distance_of(lens_type), far, wavelength, lens_type.optics.aperture, camera.focus(lens_type)
+        depth=depth,
+        distance=camera.distance_of(lens_type),
+        field=far,
+        wavelength=wavelength,
+        focal_length=1 / (1 / depth + 1 / camera.focus(lens_type)),
+        entrance_pupil=(aperture, 0.0),
+        working_f_number=depth / aperture,
+        aperture=aperture,
+        focus=camera.focus(lens_type),
     )
 
 
@@ -355,4 +322,15 @@ def surface_field(camera: Camera, lens_type: LensType, wavelength: float | None)
         depth += lens.rear_principal - other.rear_principal
         distance += other.front_principal - lens.front_principal
         lens = other
-    return SurfaceField(depth, distance, far, wavelength, lens, exit_disk(lens, depth, far))
+    pupil = lens.entrance_pupil
+    return SurfaceField(
+        depth=depth,
+        distance=distance,
+        field=far,
+        wavelength=wavelength,
+        focal_length=lens.focal_length,
+        entrance_pupil=(2 * pupil.radius, lens.front_principal - pupil.position),
+        working_f_number=lens.working_f_number(depth),
+        prescription=lens,
+        disk=exit_disk(lens, depth, far),
+    )

@@ -23,7 +23,6 @@ from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
 from ommatid.scenes.geometry.optical_terms import ThroughFocus
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics import distortion
-from ommatid.scenes.pose import poses
 
 from .field import LEAST_VERGENCE, LensField, field_of
 from .point_spread import grid_of, point_spread, strehl_ratio
@@ -177,8 +176,7 @@ def _distortion(camera: Camera, lens_type: LensType, rays: LensField) -> float:
     """Return the relative change of the magnification at the rim, which gets light."""
     given, height = lens_type.optics.distortion, rays.field
     if given is not None:
-        pairs = zip(camera.sub_imagers, poses(camera), strict=True)
-        limit = max(distortion.field(camera, sub, pose) for sub, pose in pairs if sub.type == lens_type)
+        limit = distortion.largest_field(camera, lens_type)
         tangent, scale = height / rays.depth, camera.distance_of(lens_type) / camera.half_diagonal
         return tangent / float(distortion.undistort(tangent, 0.0, *given, scale, limit)[0]) - 1
     if lens_type.optics.surfaces is None:

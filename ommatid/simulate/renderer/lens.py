@@ -16,8 +16,7 @@ from typing import Any
 
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.distortion import field, undistort
-from ommatid.scenes.pose import poses
+from ommatid.scenes.optics.distortion import largest_field, undistort
 
 from .loaded import dr, mi
 
@@ -62,8 +61,7 @@ class LensModel:
         self._distortion = lens_type.optics.distortion
         self._corner = camera.distance_of(lens_type) / camera.half_diagonal
         if self._distortion is not None:
-            pairs = zip(camera.sub_imagers, poses(camera), strict=True)
-            self._limit = max(field(camera, sub, pose) for sub, pose in pairs if sub.type == lens_type)
+            self._limit = largest_field(camera, lens_type)
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights.

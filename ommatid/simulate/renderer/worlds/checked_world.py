@@ -78,7 +78,7 @@ def check_world_files(path: Path, where: str, allow_outside: bool = False) -> Ch
     Raises InputError.
     """
     known = _known.get((path, allow_outside))
-    if known is not None and _signatures(known[1].files) == known[0]:
+    if known is not None and [signature(each) for each in known[1].files] == known[0]:
         return known[1]
     expansion = _Expansion(path, allow_outside)
     try:
@@ -91,19 +91,17 @@ def check_world_files(path: Path, where: str, allow_outside: bool = False) -> Ch
     except (OSError, ValueError) as error:
         raise InputError(f"{where}: {printable(path)} could not be read ({printable(error, SHOWN)})") from error
     world = CheckedWorld("\n".join(expansion.text), expansion.lines, list(expansion.files), expansion.checked)
-    _known[path, allow_outside] = _signatures(world.files), world
+    _known[path, allow_outside] = [signature(each) for each in world.files], world
     return world
 
 
-def _signatures(files: list[Path]) -> list[tuple[int, ...]]:
-    signatures = list[tuple[int, ...]]()
-    for path in files:
-        try:
-            status = path.stat()
-            signatures.append((status.st_mtime_ns, status.st_ctime_ns, status.st_size, status.st_ino, status.st_dev))
-        except OSError:
-            signatures.append(())
-    return signatures
+def signature(path: Path) -> tuple[int, ...]:
+    """Return numbers that differ if a file has changed, none of a file that is missing."""
+    try:
+        status = path.stat()
+    except OSError:
+        return ()
+    return status.st_mtime_ns, status.st_ctime_ns, status.st_size, status.st_ino, status.st_dev
 
 
 class _Expansion:

@@ -26,7 +26,7 @@ from ommatid.runtime.files import fingerprint
 from ommatid.runtime.machine import free_memory
 from ommatid.runtime.printable import printable
 
-from .checked_world import CheckedWorld, reason_of
+from .checked_world import CheckedWorld, reason_of, signature
 
 LONGEST = 600.0  # seconds that a world may take
 RESERVE = 100_000_000  # bytes that a world may take even if less are free
@@ -47,7 +47,7 @@ def try_world(world: CheckedWorld, variant: str, where: str, seconds: float = LO
     Raises InputError if Mitsuba refuses it, or if that process dies or does not end.
     """
     named = [[str(path), plugin] for path, plugin in world.checked.items()]
-    files = [[*names, *_version(Path(names[0]))] for names in named]
+    files = [[*names, *signature(Path(names[0]))] for names in named]
     key = fingerprint([world.text, files, variant])
     if key in _built:
         return
@@ -100,11 +100,6 @@ def _death(code: int) -> str:
 
 def _shown(at: str) -> str:
     return f"the file {printable(Path(at).name, SHOWN)}" if at else "the world"
-
-
-def _version(path: Path) -> list[int]:
-    status = path.stat()
-    return [status.st_mtime_ns, status.st_ctime_ns, status.st_size, status.st_ino]
 
 
 def main() -> None:

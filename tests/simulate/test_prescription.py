@@ -24,6 +24,11 @@ from ..examples import GALLERY
 from ..lenses import BICONVEX, DOUBLE_GAUSS, camera_with, lens, turned_round
 
 
+def f_number(one: Prescription) -> float:
+    """Return the focal length over the diameter of the entrance pupil."""
+    return one.focal_length / (2 * one.entrance_pupil.radius)
+
+
 @pytest.mark.parametrize(
     ("name", "yellow", "abbe"),
     [
@@ -80,7 +85,7 @@ def test_the_pupils_are_the_thin_lens_s_images_of_the_stop() -> None:
     found = thin(10.0, 2.0, 0.5, before=True)
     assert found.entrance_pupil == pytest.approx((0.0, 0.5))
     assert found.exit_pupil == pytest.approx((2.0 - 2.5, 0.5 * 1.25))
-    assert found.f_number == pytest.approx(10.0)
+    assert f_number(found) == pytest.approx(10.0)
 
 
 def test_turning_a_lens_round_exchanges_its_pupils_and_planes() -> None:
@@ -173,7 +178,7 @@ def test_pbrt_s_text_is_read_as_it_is(tmp_path: Path) -> None:
     assert surfaces[-1].thickness is None
     found = prescribe(surfaces)
     assert found.focal_length == pytest.approx(50, rel=0.01)
-    assert found.f_number == pytest.approx(2, rel=0.03)
+    assert f_number(found) == pytest.approx(2, rel=0.03)
     # The file's own distance to the film, 36.77 mm, is where this lens shows far things sharp.
     assert found.rear_principal + found.focal_length - found.vertices[-1] == pytest.approx(36.77, rel=0.02)
 
@@ -203,7 +208,7 @@ def test_a_scene_holds_what_its_lens_file_holds(tmp_path: Path) -> None:
         assert read(tmp_path / "again.toml").camera == scene.camera
         camera = derive(scene)
         found = [prescription_of(camera, kind) for kind in camera.types]
-        assert [one.f_number for one in found] == pytest.approx([stop] * 3, rel=0.01)
+        assert [f_number(one) for one in found] == pytest.approx([stop] * 3, rel=0.01)
 
 
 def test_lens_files_that_are_not_there_and_glasses_that_are_unknown_are_named(tmp_path: Path) -> None:

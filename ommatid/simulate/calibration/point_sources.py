@@ -40,13 +40,6 @@ STRAYS = 2  # rays of a sensor pixel that float32 may have rounded over the edge
 MARGIN = Fraction(1, 1024)  # pixels of f by which rays may land beside a footprint: far more than they are rounded
 
 
-def grid(camera: Camera, spacing: int, row: int, column: int) -> FloatArray:
-    """Return the target, (rows, columns), with sources of radiance 1 at every `spacing` pixels from (row, column)."""
-    image = np.zeros(camera.shape)
-    image[row::spacing, column::spacing] = 1.0
-    return image
-
-
 def rows_from_points(
     renderer: Renderer,
     every: list[Pixels],
@@ -110,7 +103,7 @@ class SourceSweep:
         for first in range(0, offsets, together):
             chunk = range(first, min(first + together, offsets))
             channels = [chunk[start : start + levels.size] for start in range(0, len(chunk), levels.size)]
-            renderer.set_target(*(_sources(renderer.camera, spacing, shown, levels) for shown in channels))
+            renderer.set_target(*(sources(renderer.camera, spacing, shown, levels) for shown in channels))
             readings = renderer.expose(self._pixels, work.samples, seeds)[:, 0]
             for shown, reading in zip(channels, readings, strict=False):
                 alone = reading[:, None] if levels.size == 1 else separate_sources(reading, work.samples, levels)
@@ -154,10 +147,12 @@ def separate_sources(readings: FloatArray, samples: int, levels: IntArray) -> Fl
     return (whole.astype(np.int64)[:, None] // levels % base) / samples
 
 
-def _sources(camera: Camera, spacing: int, offsets: range, levels: IntArray) -> FloatArray:
+def sources(camera: Camera, spacing: int, offsets: range, levels: IntArray) -> FloatArray:
+    """Return the target, (rows, columns), with a source at every `spacing` pixels for each offset, of its radiance."""
     image = np.zeros(camera.shape)
     for offset, level in zip(offsets, levels.tolist(), strict=False):
-        image += level * grid(camera, spacing, *divmod(offset, spacing))
+        row, column = divmod(offset, spacing)
+        image[row::spacing, column::spacing] += level
     return image
 
 

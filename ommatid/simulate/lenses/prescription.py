@@ -148,11 +148,6 @@ class Prescription:
         position = self.vertices[-1] - tilted / angle
         return Pupil(float(position), float(self.semi_diameter[self.stop] / abs(angle)))
 
-    @property
-    def f_number(self) -> float:
-        """Focal length over the diameter of the entrance pupil."""
-        return self.focal_length / (2 * self.entrance_pupil.radius)
-
     def working_f_number(self, depth: float) -> float:
         """Return the f-number of the cone of light at a sensor `depth` behind the rear principal plane."""
         # The ray from the stop's rim to the sensor's axis leaves the last surface with the slope -radius / (B + s D).

@@ -224,12 +224,6 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
     return KernelFootprints(places, 1, shapes, light * weights, np.zeros((0, 0, 3)))
 
 
-def entries(camera: Camera, lens_type: LensType, reach: float) -> int:
-    """Upper bound of the number of entries of `matrix` for blurs of a reach, to check that it fits into memory."""
-    tall, wide = (_reached(lens_type, reach, size) for size in camera.shape)
-    return lens_type.measurements * tall * wide
-
-
 Sides = tuple[float, float]  # of a footprint, down and across, in pixels of f
 
 

@@ -99,12 +99,12 @@ def light(
     Raises InputError if the requested variant does not work here, ValueError if the samples are "auto".
     """
     scene = setup.scene
-    if scene.render.samples == "auto":
+    if work is None and scene.render.samples == "auto":
         raise ValueError("expected a number of samples, got 'auto', which `render_until` renders")
     variant = choose(scene.render.variant)  # before Mitsuba is loaded
     from .renderer.renderer import Renderer
 
-    work = plan(scene.render.samples, scene.render.sampler) if work is None else work
+    work = plan(scene.render.sample_count, scene.render.sampler) if work is None else work
     renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     mean, variance = render_bands(renderer, scene.render.seed, work, progress, checkpoint)

@@ -17,7 +17,6 @@ import numpy as np
 
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import choose
@@ -67,9 +66,7 @@ def calibrate_until(
     while True:
         samples = _next(tried, SampleLaw.expected(scene.render.sampler), most)
         plans = plans_of(setup, samples, float64)
-        model = rendered_model(
-            replace(setup, scene=_with_samples(scene, samples)), progress, plans=plans, float64=float64
-        )
+        model = rendered_model(setup, progress, plans=plans, float64=float64)
         spent = {name: plan.total for name, plan in plans.items()}
         tried.append({"asked": max(spent.values()), "samples": spent, "adds": stopping_rule.added_error(model)})
         if tried[-1]["adds"] <= DONE or samples >= most or _is_flat(tried):
@@ -86,7 +83,7 @@ def calibrate_until(
     }
     totals = [sum(each["samples"][name] for each in tried) for name in plans]
     counts = {"samples": max(totals), "fewest_samples": min(totals), "auto": adaptive}
-    return replace(model, scene=_with_samples(model.scene, "auto"), record=model.record | counts)
+    return replace(model, record=model.record | counts)
 
 
 def plans_of(setup: Setup, samples: int, float64: bool) -> Plans:
@@ -112,8 +109,3 @@ def _is_flat(tried: list[dict[str, Any]]) -> bool:
         return False
     adds = [each["adds"] for each in tried[-3:]]
     return max(adds) - min(adds) < FLAT * max(adds)
-
-
-def _with_samples(scene: Scene, samples: int | str) -> Scene:
-    calibration = scene.calibration.model_copy(update={"samples": samples})
-    return scene.model_copy(update={"calibration": calibration})

@@ -148,8 +148,7 @@ def pilot(setup: Setup, plans: Plans) -> Pilot:
     """Trace a pilot for the samples of `plans`, entry by entry. Raises InputError as `setup_of_pilot` does."""
     scene = setup.scene
     traced = _affordable(setup, plans)
-    changed = setup_of_pilot(setup, samples=max(work.total for work in traced.values()), fit="none")
-    model = rendered_model(changed, plans=traced, float64=scene.calibration.samples == "auto")
+    model = rendered_model(setup_of_pilot(setup, fit="none"), plans=traced, float64=scene.calibration.samples == "auto")
     few = not any(lens.optics.draws_more for lens in setup.simulated.types)
     law = SampleLaw.expected(scene.render.sampler) if few else SampleLaw()
     return Pilot(model, *_factor(setup.camera, traced, plans, law))
@@ -163,9 +162,7 @@ def world_variance(setup: Setup, plans: Plans) -> tuple[FloatArray, bool]:
     """
     few = min(_affordable(setup, plans).values(), key=lambda work: work.samples)
     few = Plan(BATCHES, few.samples)
-    changed = setup_of_pilot(setup)
-    render = changed.scene.render.model_copy(update={"samples": few.total})
-    rendering = light(replace(changed, scene=with_tables(changed.scene, render=render)), work=few)
+    rendering = light(setup_of_pilot(setup), work=few)
     factor, extrapolated = _factor(setup.camera, dict.fromkeys(plans, few), plans, SampleLaw())
     return factor * rendering.stated, extrapolated
 

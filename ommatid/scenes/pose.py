@@ -112,11 +112,6 @@ class PixelPlaces:
         self._pitch = camera.pixel_pitch
         self._turned = camera.tolerance is not None or any(lens_type.is_rotated for lens_type in camera.types)
 
-    @property
-    def count(self) -> int:
-        """Number of pixels."""
-        return int(self._starts[-1])
-
     def numbers(self, pixels: IntArray) -> tuple[IntArray, IntArray]:
         """Return the number of each of some ascending pixels within its sub-imager, and the latter's in the camera."""
         counts = self._counts(pixels)

@@ -290,8 +290,7 @@ class AdaptiveRounds:
             return still
         values, variance, target = mean[still], variance[still], target[still]
         sub.scatter = mean_of_known(variance) * sub.last.passes
-        float64 = self._renderer.float32_samples(2) == 1
-        most = MOST_EXACT if float64 else min(samples_within(values, AIM * target), MOST_SAMPLES)
+        most = MOST_EXACT if self._renderer.is_fast else min(samples_within(values, AIM * target), MOST_SAMPLES)
         factors = np.quantile(variance / (AIM * target), QUANTILES)
         totals = [sub.law.samples(float(factor), sub.last, most) for factor in factors]
         sub.left = float(np.mean(totals)) * values.size

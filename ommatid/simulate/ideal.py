@@ -17,7 +17,7 @@ from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
-from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, Views, views_as_designed
+from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, views_as_designed
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType, SubImager
@@ -137,10 +137,8 @@ def designed_kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
 
 
 def _designed_by_kernels(camera: Camera) -> FittedMatrix:
-    views: dict[str, Views] = {}
-    for lens_type in camera.types:
-        subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
-        views[lens_type.name] = views_as_designed(subs)
+    by_type = ((lens, [sub for sub in camera.sub_imagers if sub.type == lens]) for lens in camera.types)
+    views = {lens.name: views_as_designed(subs) for lens, subs in by_type}
     blurred = (lens_type for lens_type in camera.types if not camera.has_boxes(lens_type))
     return FittedMatrix(camera, views, {each.name: designed_kernels(camera, each) for each in blurred})
 

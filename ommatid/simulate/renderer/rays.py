@@ -34,8 +34,6 @@ from .real_lens import real_lens
 from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each
-
-
 Seed = Callable[[int], int]  # of a sampler, by the index of a sensor
 
 

@@ -182,18 +182,18 @@ class Renderer:
     def _passes(self, pixels: Pixels, work: Plan, seeds: Sequence[Seed], points: Points) -> FloatArray:
         """Return the readings of pixels whose rays start together: (passes, pixels)."""
         generator, seed = self._generators[pixels.group], block_seed(seeds[0](pixels.sensor), pixels.block.start)
-        lens_type = self.camera.sub_imagers[pixels.sensor].type
-        away, light = margin(self.camera, lens_type), None
+        lens_type, light = self.camera.sub_imagers[pixels.sensor].type, None
         averages = self._averages_of(lens_type) if points in ("sobol", "averages") else None
         if averages is not None and points == "averages":
-            by, draws = TYPICAL * away, SobolDraws(seed, pixels.count, 1, middle=True)  # a pinhole draws nothing
-            rays = generator.rays(pixels, Plan(1, 1), draws)
+            draws = SobolDraws(seed, pixels.count, 1, middle=True)  # a pinhole draws nothing
+            rays, by = generator.rays(pixels, Plan(1, 1), draws), TYPICAL * margin(self.camera, lens_type)
             met = (averages.light(rays.ray, moved=moved) for moved in ((by, 0), (-by, 0), (0, by), (0, -by)))
             return np.stack([self._weighed(pixels.group, rays, light) for light in met])
         if points == "sampler":
             rays = generator.sampled(pixels, work, seed)
         elif points == "grid":
-            rays = generator.rays(pixels, work, generator.grid(pixels, isqrt(work.samples), away, seeds))
+            draws = generator.grid(pixels, isqrt(work.samples), margin(self.camera, lens_type), seeds)
+            rays = generator.rays(pixels, work, draws)
         else:
             draws = SobolDraws(seed, pixels.count * work.total, work.samples, middle=averages is not None)
             rays = generator.rays(pixels, work, draws)

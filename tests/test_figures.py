@@ -5,6 +5,7 @@ Those marked `figures` take minutes: `make figures` runs them.
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import shlex
@@ -53,6 +54,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/camera.md", "The gallery"): "runs of the large scenes, minutes each",
     ("docs/choose-a-camera.md", "Describe the sensor and one lens"): "lengths of the example",
     ("docs/choose-a-camera.md", "What diffraction allows"): "lengths of the example",
+    ("docs/choose-a-camera.md", "Rendered proof"): "nine runs of 119 x 119 pixels, a minute each",
     ("docs/choose-a-camera.md", "Masks, or more lens types"): "predictions of 119 x 119 pixels, half a minute each",
     ("docs/diffraction.md", "One wavefront"): "constants of the text",
     ("docs/diffraction.md", "Which f-number"): "f-numbers",
@@ -207,6 +209,37 @@ def phone(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("phone") / "phone.toml"
     path.write_text(next(block.text for block in blocks(DOCS / "choose-a-camera.md") if block.file_name), "utf-8")
     return str(path)
+
+
+@pytest.mark.slow
+def test_the_lenses_of_three_sensors(ommatid: Command, here: Path) -> None:
+    """As the commands of the page print them, and those of the cameras that are a millimetre thinner."""
+    page, errors = list(blocks(DOCS / "choose-a-camera.md")), dict[str, tuple[float, float, float]]()
+    (here / "ask.toml").write_text(next(block.text for block in page if "[design]" in block.text), "utf-8")
+    for line, _ in next(block for block in page if "-o machine" in block.text).commands():
+        _, *arguments = shlex.split(line)
+        name = arguments[arguments.index("-o") + 1]
+        found = json.loads(ommatid(*arguments, "--json").out)
+        (limit,) = (float(text) for text in re.findall(r"thickness=([\d.]+)", line))
+        with (here / name / "front.csv").open(newline="", encoding="utf-8") as stream:
+            rows = [row for row in csv.DictReader(stream) if row["limit"] == "depth"]
+        thin = min(float(row["mse"]) for row in rows if float(row["depth"]) <= limit - 1)
+        errors[name] = found["cameras"][0]["mse"], found["bound"], thin
+    error, bound, _ = errors["machine"]
+    check_figures("choose-a-camera.md", "is better by more than {} %.", 100 * (error / bound - 1))
+    check_figures(
+        "choose-a-camera.md",
+        "| machine vision | 2 x 1/2 + 1/3 | {} | {} | 1/3 whole, and two open by 1/2: {} |",
+        *errors["machine"],
+    )
+    check_figures(
+        "choose-a-camera.md", "| phone | 3 x 1/2 | {} | {} | three of 1/4, open by 1/2: {} |", *errors["phone"]
+    )
+    check_figures(
+        "choose-a-camera.md",
+        "| infrared | 3 x 1/2 | {} | {} | 1/3 whole, and two open by 1/2: {} |",
+        *errors["infrared"],
+    )
 
 
 def test_the_optics_of_the_chosen_camera(phone: str) -> None:

@@ -198,7 +198,8 @@ def draw_front(path: Path, points: Sequence[FrontPoint], best: BestCamera, files
 def _sentence(best: BestCamera) -> str:
     """Return what the figure shows in a sentence of two lines."""
     name, bound = _claim(best)
-    made = f"{words_of(best.whole[0].counts, best.space)}: {_found(best, best.whole[0])}\n" if best.whole else ""
+    kind = "" if best.space.groups.goal == "information" else "MSE "
+    made = f"{words_of(best.whole[0].counts, best.space)}: {kind}{_found(best, best.whole[0])}\n" if best.whole else ""
     types = f"{len(best.space.types)} lens types, {best.budget:.3g} {best.space.unit}"
     return f"{made}{name} {bound} ({types})"
 

@@ -19,7 +19,7 @@ from ommatid.reconstruct.assumptions import assumptions_at
 from ommatid.reconstruct.frame.bands import Bands
 from ommatid.reconstruct.frame.conjugate_gradients import frame_system
 from ommatid.reconstruct.method_choice import MethodChoice
-from ommatid.reconstruct.methods.method import Execution
+from ommatid.reconstruct.methods.method import EstimationTask, Execution
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import one_thread
@@ -101,7 +101,7 @@ class DesignSpace:
             key = "readings" if _area(self.scene) is None else "sensor_area"
             raise InputError(
                 f"{self.scene.source}: design.{key}: the smallest array takes {least:.3g} {self.unit}, got"
-                f" {budget:.3g}; raise it"
+                f" {budget:.4g}; raise it"
             )
         with one_thread():
             mixture = best_mixture(self.groups, budget, tight)
@@ -124,20 +124,20 @@ class DesignSpace:
             return bool(whole) and whole[0].found.error <= error
 
         with one_thread():
-            least = _least(low, most, mixed) / (1 + CLOSE) if mixed(most) else most
-            reached = next((budget for share in MORE if made(budget := least * share)), None)
+            least = _least(low / MOST_READINGS, most, mixed) / (1 + CLOSE) if mixed(most) else most
+            reached = next((budget for share in MORE if made(budget := max(least * share, low))), None)
         if reached is None:
             within = self.best(most, 1, NEARLY)
-            nearest = min((each.found.error for each in within.whole), default=within.mixture.found.error)
+            nearest = f"the least is {within.whole[0].found.error:.4g}" if within.whole else "none fits the sensor"
             raise InputError(
                 f"{self.scene.source}: design.error: no camera of these lens types that costs up to {most:.3g}"
-                f" {self.unit} has an error of {error:g}; the least is {nearest:.4g}"
+                f" {self.unit} has an error of {error:g}; {nearest}"
             )
         return least, self.best(_least(max(low, least), reached, made))
 
     def fits(self, counts: tuple[int, ...]) -> bool:
         """Return True if whole arrays fit the sensor, where the scene gives one."""
-        if self.scene.camera.sensor is None and _area(self.scene) is None:
+        if not any(counts) or (self.scene.camera.sensor is None and _area(self.scene) is None):
             return True
         try:
             derive(self.camera(counts))
@@ -202,7 +202,7 @@ def design_space(scene: Scene, wanted: Sequence[LensCandidate]) -> DesignSpace:
         except InputError as error:
             refused[candidate.words] = _reason(scene, error)
     if not types:
-        raise InputError(f"{scene.source}: no lens type is possible: {': '.join(next(iter(refused.items())))}")
+        raise _impossible(scene, refused)
     with one_thread():
         bands, kept, others = _possible(scene, list(types))
         depths, cells = np.array([types[each] for each in kept]).T
@@ -213,7 +213,8 @@ def design_space(scene: Scene, wanted: Sequence[LensCandidate]) -> DesignSpace:
         counts = [own[each] for each in kept]
         known = own and own.keys() <= set(kept)
         found = WholeMixture(tuple(counts), groups.evaluate(np.array(counts, dtype=np.float64))) if known else None
-    budget = area or table.readings or sum(lens.count / float(lens.ratio) ** 2 for lens in camera.types)
+    readings = sum(own.values()) if own else camera.measurements / camera.unknowns
+    budget = area or table.readings or readings
     return DesignSpace(described, tuple(kept), groups, depths, cells, budget, found, {**refused, **others})
 
 
@@ -236,6 +237,8 @@ def _measures(scene: Scene, candidate: LensCandidate) -> tuple[float, float]:
 
     Raises InputError for a lens type that the camera cannot have.
     """
+    if candidate.ratio.denominator != 1:
+        raise InputError("the bound takes magnifications 1/m of a whole m, whose pixels all lie alike on those of f")
     thickness, widest = scene.design.thickness if scene.design else None, scene.camera.lens_pitch
     widest += max(derive(scene).shape) * scene.camera.pixel_pitch + (candidate.aperture or 0.0)
     single = scene_of(scene, [candidate], None if _area(scene) is None else widest)
@@ -282,10 +285,23 @@ def _check(scene: Scene, camera: Camera) -> None:
         )
     if not scene.has_noise:
         raise InputError(f"{where}: without noise every mixture is exact or has a null space; set noise.variance")
+    check_known(scene)
+    if table.bits and scene.camera.binning == "sum":
+        raise InputError(f"{where}: design.bits are of averages, got camera.binning = 'sum'; remove one")
     if table.error is not None and table.goal != "error":
         raise InputError(f"{where}: design.error is reached at least cost, design.goal is '{table.goal}'; remove one")
     if table.sensor_area is not None and table.readings is not None:
         raise InputError(f"{where}: design.readings and design.sensor_area both limit the camera; remove one")
+
+
+def check_known(scene: Scene) -> None:
+    """Raise InputError for an estimator that takes noise or prior for others than they are."""
+    for key in ("noise_variance", "prior_variance"):
+        if getattr(scene.estimator, key) is not None:
+            raise InputError(
+                f"{scene.source}: the bound is that of an estimator that knows noise and prior, got estimator.{key};"
+                " remove it"
+            )
 
 
 def _own_arrays(camera: Camera) -> Counter[LensCandidate]:
@@ -293,8 +309,9 @@ def _own_arrays(camera: Camera) -> Counter[LensCandidate]:
     last, found = camera.types[-1], Counter[LensCandidate]()
     for lens in camera.types:
         candidate = LensCandidate(lens.ratio)
+        most = tuple((size - candidate.side + 1) // lens.ratio for size in camera.shape)
         whole = lens.array == (candidate.side, candidate.side) and not lens.steered and lens.is_sliding
-        if not whole or (lens.optics, lens.open) != (last.optics, last.open):
+        if not whole or lens.pixels != most or (lens.optics, lens.open) != (last.optics, last.open):
             return Counter()
         found[candidate] += 1
     return found
@@ -303,44 +320,43 @@ def _own_arrays(camera: Camera) -> Counter[LensCandidate]:
 def _bands(scene: Scene, types: Sequence[LensCandidate]) -> Bands:
     """Return the transfer functions of a camera of all types.
 
-    They are those in front of the scene's target or, where that is small or very large, of a square of pixels, with the
-    light of the target. What surfaces do varies over the field: they have the scene's target.
+    They are those in front of the scene's target or, where that is small or very large, of a square of pixels. What
+    surfaces do varies over the field: they have the scene's target. Noise that depends on light is that of each type
+    alone in front of the target, so that no candidate changes another's.
     """
-    camera, side = derive(scene), FINE_SIDE if scene.target.detail > 1 else SIDE
-    if camera.has_surfaces or (min(camera.shape) >= side and camera.unknowns <= LARGEST):
-        return _bands_and_weights(scene, scene, types, camera.shape)[0]
-    tables = scene.plain()
-    tables["target"] = {key: each for key, each in tables["target"].items() if key not in ("image", "origin")}
-    square = parse({**tables, "target": {**tables["target"], "shape": [side, side]}}, scene.source)
-    bands, weights = _bands_and_weights(square, scene, types, (side, side))
+    camera, side, shown = derive(scene), FINE_SIDE if scene.target.detail > 1 else SIDE, scene
+    if not camera.has_surfaces and (min(camera.shape) < side or camera.unknowns > LARGEST):
+        tables = scene.plain()
+        tables["target"] = {key: each for key, each in tables["target"].items() if key not in ("image", "origin")}
+        shown = parse({**tables, "target": {**tables["target"], "shape": [side, side]}}, scene.source)
+    task = _task(shown, scene, types)
+    bands = frame_system(task).bands
+    if bands is None:
+        raise InputError(f"{scene.source}: the bound is that of lenses that see the same everywhere")
     if scene.sensor is None:
         return bands
-    _, own = _bands_and_weights(scene, scene, types, camera.shape)
-    actual = [each * here / there for each, here, there in zip(bands.weights, own, weights, strict=True)]
-    return replace(bands, weights=tuple(actual))
+    alone = [_weights(_task(scene, scene, [each]))[0] for each in types]
+    weights = [each * own / here for each, own, here in zip(bands.weights, alone, _weights(task), strict=True)]
+    return replace(bands, weights=tuple(weights))
 
 
-def _bands_and_weights(
-    scene: Scene, original: Scene, types: Sequence[LensCandidate], shape: tuple[int, int]
-) -> tuple[Bands, list[float]]:
-    """Return the transfer functions in front of a target of some shape, and the mean weight of each type's readings.
-
-    original : the scene whose prior it is
-    """
+def _task(scene: Scene, original: Scene, types: Sequence[LensCandidate]) -> EstimationTask:
+    """Return what the estimator of a camera of these types is given; original : the scene whose prior it is."""
     camera, tables = derive(original), scene.plain()
     prior, _ = prior_without_stack(Setup.from_scene(original).calibrated)
-    width = max((max(shape) + each.ratio) / each.ratio for each in types) * camera.pixel_pitch
+    width = max((max(derive(scene).shape) + each.ratio) / each.ratio for each in types) * camera.pixel_pitch
     tables["camera"] = {key: each for key, each in tables["camera"].items() if key not in ("sensor", "lens_pitch")}
     tables["camera"]["lens_pitch"] = f"{max(float(width), camera.lens_pitch)!r} mm"
     tables["estimator"] = {**tables.get("estimator", {}), "method": "frame"}
     setup = Setup.from_scene(with_tables(scene_of(parse(tables, scene.source), types), prior=prior))
     recording, choice = recording_without_rays(setup), MethodChoice("frame", "", 0, 0.0)
-    task = assumptions_at(recording.stack, recording.model, choice, recording.image, Execution(quick=True)).method.task
-    bands = frame_system(task).bands
-    if bands is None:
-        raise InputError(f"{scene.source}: the bound is that of lenses that see the same everywhere")
+    return assumptions_at(recording.stack, recording.model, choice, recording.image, Execution(quick=True)).method.task
+
+
+def _weights(task: EstimationTask) -> list[float]:
+    """Return the mean weight of the readings of each lens type."""
     weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
-    return bands, [float(weights[rows].mean()) for rows in setup.camera.type_slices()]
+    return [float(weights[rows].mean()) for rows in task.model.camera.type_slices()]
 
 
 def _possible(scene: Scene, types: Sequence[LensCandidate]) -> tuple[Bands, list[LensCandidate], dict[str, str]]:
@@ -362,8 +378,13 @@ def _possible(scene: Scene, types: Sequence[LensCandidate]) -> tuple[Bands, list
         except InputError as error:
             refused[each.words] = _reason(scene, error)
     if not kept:
-        raise InputError(f"{scene.source}: no lens type is possible: {': '.join(next(iter(refused.items())))}")
+        raise _impossible(scene, refused)
     return _bands(scene, kept), kept, refused
+
+
+def _impossible(scene: Scene, refused: dict[str, str]) -> InputError:
+    reason = next((f"{words}: {why}" for words, why in refused.items()), "none is given")
+    return InputError(f"{scene.source}: no lens type is possible: {reason}")
 
 
 def _reason(scene: Scene, error: InputError) -> str:

@@ -64,7 +64,7 @@ def rows(best: BestCamera, with_edges: Sequence[float | str]) -> list[tuple[str,
     mixture, space = best.mixture, best.space
     name, bound = _claim(best)
     which = (
-        f"{len(space.types)} lens types, {best.budget:.3g} {space.unit}, windows on whole pixels, far from the edges"
+        f"{len(space.types)} lens types, {best.budget:.4g} {space.unit}, windows on whole pixels, far from the edges"
     )
     lines = [
         (name, f"{bound}: {which}"),
@@ -76,7 +76,9 @@ def rows(best: BestCamera, with_edges: Sequence[float | str]) -> list[tuple[str,
     if not best.whole:
         lines.append(("whole arrays", "none fit the sensor"))
     if space.own is not None:
-        lines.append(("this camera", f"{words_of(space.own.counts, space)}: {_found(best, space.own)}"))
+        cost = space.cost(space.own)
+        others = "" if abs(cost / best.budget - 1) < PART else f", which costs {cost:.3g} {space.unit}"
+        lines.append(("this camera", f"{words_of(space.own.counts, space)}{others}: {_found(best, space.own)}"))
     if space.scene.camera.tolerance is not None:
         lines.append(("tolerance", "counts in the errors with edges; the bound is that of lenses in their places"))
     by_reason = groupby(sorted(space.refused.items(), key=lambda each: each[1]), key=lambda each: each[1])
@@ -113,7 +115,7 @@ def _found(best: BestCamera, each: WholeMixture) -> str:
     above, goal = best.above(each.found), best.space.groups.goal
     if goal == "information":
         return f"{_value(best, each.found)}, {above:.1%} below; error {each.found.error:.4g}"
-    differs = f"{above:.1%} above" if above < 1 else f"{above + 1:.3g} times that"
+    differs = f"{abs(above):.1%} {'above' if above >= 0 else 'below'}" if above < 1 else f"{above + 1:.3g} times that"
     return f"{_value(best, each.found)}, {differs}; {best.space.information(each):.3g} bits per pixel"
 
 
@@ -200,7 +202,7 @@ def _sentence(best: BestCamera) -> str:
     name, bound = _claim(best)
     kind = "" if best.space.groups.goal == "information" else "MSE "
     made = f"{words_of(best.whole[0].counts, best.space)}: {kind}{_found(best, best.whole[0])}\n" if best.whole else ""
-    types = f"{len(best.space.types)} lens types, {best.budget:.3g} {best.space.unit}"
+    types = f"{len(best.space.types)} lens types, {best.budget:.4g} {best.space.unit}"
     return f"{made}{name} {bound} ({types})"
 
 

@@ -226,7 +226,7 @@ def best_whole(groups: WaveGroups, budget: float, start: Mixture, most: int, fit
             known[counts] = WholeMixture(counts, groups.evaluate(np.array(counts, dtype=np.float64)))
         return known[counts].found.value
 
-    counts = tuple(int(part) for part in np.floor(start.amounts + PART))
+    counts = tuple(int(part) for part in np.floor(start.amounts))
     if not fits(counts):
         counts = tuple(0 for _ in counts)
     while larger := list(_more(groups, counts, budget, fits)):

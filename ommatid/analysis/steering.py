@@ -36,6 +36,7 @@ from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import DesignTable
 
+from .best_camera import check_known
 from .mixture import WaveGroups, best_mixture
 from .predicted_recording import recording_without_rays
 
@@ -121,11 +122,16 @@ def _check(scene: Scene, camera: Camera, weights: FloatArray) -> None:
             f"{where}: --steer: expected weights of {camera.rows} x {camera.columns} pixels, some above 0, got"
             f" {' x '.join(map(str, weights.shape))}"
         )
-    if scene.world is not None or camera.has_detail or camera.has_surfaces or camera.tolerance is not None:
+    distorted = any(lens.optics.distortion is not None for lens in camera.types)
+    if camera.has_detail or camera.has_surfaces or camera.tolerance is not None or distorted:
         raise InputError(
-            f"{where}: windows are placed for cameras in their places, without surfaces, in front of a flat target that"
-            " is no finer than f"
+            f"{where}: windows are placed for cameras in their places, without surfaces and distortion, in front of a"
+            " target that is no finer than f"
         )
+    if scene.world is not None or scene.sensor is not None:
+        kind = "[world]" if scene.world is not None else "[sensor]"
+        raise InputError(f"{where}: windows are placed by [noise] that is the same everywhere, got a {kind}")
+    check_known(scene)
     if not scene.has_noise:
         raise InputError(f"{where}: windows are placed by the noise of their readings; set noise.variance")
 
@@ -219,7 +225,10 @@ def _bound(covariance: FloatArray, share: FloatArray, blocks: Sequence[sparse.cs
 
 
 def _with_windows(scene: Scene, windows: Sequence[PlacedWindow], table: DesignTable) -> Scene:
-    """Return the scene with the windows as further lens types, one of each type whose optics they have."""
+    """Return the scene with the windows as further lens types, one of each type whose optics they have.
+
+    Raises InputError where their patches do not fit the sensor.
+    """
     tables = scene.plain()
     lenses: list[dict[str, Any]] = list(tables["camera"]["lens"])
     for name in dict.fromkeys(window.lens for window in windows):
@@ -227,9 +236,14 @@ def _with_windows(scene: Scene, windows: Sequence[PlacedWindow], table: DesignTa
         steered = [
             {"at": [0, number], "window": [str(each) for each in corner]} for number, corner in enumerate(corners)
         ]
-        described = {"name": f"{STEERED}{name}", "array": [1, len(corners)], "pixels": list(table.window), "step": "0"}
+        taken = {lens["name"] for lens in lenses}
+        names = (f"{STEERED}{name}", *(f"{STEERED}{number}-{name}" for number in range(2, len(taken) + 3)))
+        free = next(each for each in names if each not in taken)
+        described = {"name": free, "array": [1, len(corners)], "pixels": list(table.window), "step": "0"}
         lenses.append({**_optics_of(scene, name), **described, "sub_imager": steered})
-    return parse({**tables, "camera": {**tables["camera"], "lens": lenses}}, scene.source)
+    made = parse({**tables, "camera": {**tables["camera"], "lens": lenses}}, scene.source)
+    derive(made)
+    return made
 
 
 def rows(camera: SteeredCamera) -> list[tuple[str, str]]:

@@ -54,7 +54,7 @@ def prove_best_camera(
     """
     table = scene.design or DesignTable()
     spaces = {bits: design_space(_with_bits(scene, bits), wanted) for bits in table.bits or (None,)}
-    found, wishes = dict[int | None, BestCamera](), dict[int | None, tuple[str, str]]()
+    found, wishes, missed = dict[int | None, BestCamera](), dict[int | None, tuple[str, str]](), Rows()
     for bits, space in spaces.items():
         if table.error is None:
             found[bits] = space.best(space.budget)
@@ -65,6 +65,7 @@ def prove_best_camera(
         except InputError:
             if bits == max(spaces, key=lambda each: each or 0):
                 raise
+            missed.append((f"{bits} bits", f"an error of {table.error:g} is out of reach"))
     chosen = min(found, key=lambda bits: _rank(found[bits], bits, table.error is not None))
     best = found[chosen]
     made, with_edges = list[Scene | None](), list[float | str]()
@@ -78,17 +79,15 @@ def prove_best_camera(
         progress(number / (len(best.whole) + (folder is not None)))
     lines = [wishes[chosen]] if chosen in wishes else []
     lines += design_report.rows(best, with_edges)
-    lines += [design_report.bits_row(bits, each) for bits, each in found.items() if bits is not None]
+    lines += missed + [design_report.bits_row(bits, each) for bits, each in found.items() if bits is not None]
     if folder is not None:
-        make_folder(folder)
-        files = {
-            (chosen, words_of(each.counts, best.space)): f"camera{number}.toml"
-            for number, each in enumerate(best.whole, 1)
-        }
-        for name, camera in zip(files.values(), made, strict=True):
-            if camera is not None:
-                write(folder / name, camera)
         points = [point for bits, space in spaces.items() for point in design_report.front(space, bits)]
+        make_folder(folder)
+        files = dict[tuple[int | None, str], str]()
+        for number, (each, camera) in enumerate(zip(best.whole, made, strict=True), 1):
+            if camera is not None:
+                files[chosen, words_of(each.counts, best.space)] = f"camera{number}.toml"
+                write(folder / f"camera{number}.toml", camera)
         design_report.write_front(folder / "front.csv", points, [_file(folder, point, files) for point in points])
         design_report.draw_front(folder / "front.png", points, best, figures)
         progress(1.0)

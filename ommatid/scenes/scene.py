@@ -110,6 +110,10 @@ class Scene(Table):
                 "camera.walls = false leaves H without a closed form: expected calibration.method 'transport', no fit,"
                 f" got '{self.calibration.method}'"
             )
+        if self.camera.binning == "sum" and self.noise is not None and self.noise.bits is not None:
+            raise ValueError(
+                "camera.binning 'sum' reads more than the full scale of noise.bits, got both; remove one of the two"
+            )
         if self.camera.binning == "sum" and self.sensor is not None:
             raise ValueError(
                 "camera.binning 'sum' takes the ideal sensor of [noise], got a [sensor]; remove one of the two"

@@ -112,6 +112,7 @@ def test_exchanges_find_the_best_of_all_whole_cameras(noise: float) -> None:
     assert min(errors) >= mixture.bound
 
 
+FIT = tuple(f"camera.lens.{name}.pixels=fit" for name in ("I", "II", "III"))
 CORRELATED = "prior.kind=exponential", "prior.correlation_length=25 mm"
 
 
@@ -167,6 +168,8 @@ REFUSED: dict[str, tuple[str, ...]] = {
         *(each for name in ("I", "II", "III") for each in ("--set", f"camera.lens.{name}.aperture=0.1 mm")),
     ),
     "design.thickness is 0.1 mm": ("--set", "design.thickness=0.1 mm"),
+    "knows noise and prior": ("--set", "estimator.noise_variance=10"),
+    "design.bits are of averages": ("--set", "camera.binning=sum", "--set", "design.bits=[8]"),
     "both limit the camera": ("--set", "design.readings=3", "--set", "design.sensor_area=1/2.3"),
     "the smallest array takes 0.0": ("--set", 'design.sensor_area=["0.01 mm", "0.01 mm"]'),
     "the least is": ("--set", "design.error=1e-9", "--set", 'design.magnifications="1/3,1/4"'),
@@ -199,7 +202,7 @@ def test_the_light_of_a_small_dark_target_counts() -> None:
         'prior.kind="exponential"',
         "prior.correlation_length=5 mm",
     )
-    described = read(GALLERY / "sensor.toml", (*dark, "target.detail=1", "camera.wavelength=none"))
+    described = read(GALLERY / "sensor.toml", (*dark, "target.detail=1", "camera.wavelength=none", *FIT))
     best = best_camera(described, [])
     trimmed = predict_scene(described, rays=False).trimmed_mse
     assert trimmed is not None
@@ -229,12 +232,61 @@ def test_types_whose_detail_the_scene_does_not_know_are_left_out() -> None:
     assert ["detail finer than f" in reason for _, reason in best.space.refused.items()] == [True]
 
 
-def test_a_camera_of_an_odd_ratio_has_readings_enough_for_itself() -> None:
+def test_ratios_whose_pixels_lie_differently_are_left_out() -> None:
+    """Of 3/5 a camera of single pixels on whole pixels of f would be better than any mean over fractions."""
     described = scene("camera.lens.I.magnification=3/5", "camera.lens.I.array=[2,2]", "camera.lens_pitch=2 mm")
-    odd = described.model_copy(
-        update={"camera": described.camera.model_copy(update={"lens": described.camera.lens[:1]})}
-    )
-    assert best_camera(odd, candidates(odd, [Fraction(3, 5)])).whole[0].counts == (1,)
+    best = best_camera(described, candidates(described, [Fraction(1, 3), Fraction(2, 5)]))
+    assert [each.words for each in best.space.types] == ["1/3"]
+    assert "whole m" in best.space.refused["2/5"]
+    assert best.space.own is None
+
+
+def test_cameras_of_no_more_than_the_budget() -> None:
+    """1.995 readings buy one array, and not two; and no camera is better than the bound."""
+    described = read(GALLERY / "tile19.toml", ("noise.variance=1", "design.readings=1.995"))
+    best = best_camera(described, candidates(described, [Fraction(1, 3)]))
+    assert all(best.space.cost(each) <= 1.995 and best.above(each.found) >= 0 for each in best.whole)
+
+
+def test_readings_are_those_of_the_pixels() -> None:
+    """Of arrays of 2 x 2 pixels each, which are no arrays that see all of the target."""
+    described = read(GALLERY / "tile19.toml", tuple(f"camera.lens.{name}.pixels=[2,2]" for name in ("I", "II", "III")))
+    space = design_space(described, candidates(described, [Fraction(1, 3)]))
+    assert space.budget == pytest.approx(4 * (9 + 16 + 25) / 19**2)
+    assert space.own is None
+    with pytest.raises(InputError, match="the smallest array takes 1 readings"):
+        space.best(space.budget)
+
+
+def test_no_candidate_changes_the_light_of_another() -> None:
+    """Lenses far from the axis have less; each type is alone in front of the target."""
+    near = "target.distance=40 mm", "target.detail=1", "camera.wavelength=none"
+    described = read(GALLERY / "sensor.toml", (*near, *FIT, "target.shape=[40,40]"))
+    errors: list[float] = []
+    for most in (5, 9):
+        own = best_camera(described, candidates(described, [Fraction(1, ratio) for ratio in range(3, most)])).space.own
+        assert own is not None
+        errors.append(own.found.error)
+    assert errors[0] == pytest.approx(errors[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("size", ['["0.3 mm","1.5 mm"]', '["0.02 mm","0.6 mm"]'])
+def test_small_sensors_have_cameras_or_none(size: str, ommatid: Command) -> None:
+    changes = "--set", "noise.variance=1", "--set", f"design.sensor_area={size}"
+    ended = ommatid("design", "tile19", *changes, "--set", 'design.magnifications="1/3,1/4,1/5"')
+    assert ended.code == 0, ended.err
+    assert ("none fit the sensor" in ended.out) is (size == '["0.02 mm","0.6 mm"]')
+
+
+def test_a_wish_that_fits_no_sensor_says_so(ommatid: Command) -> None:
+    table = 'design={magnifications="1/3,1/4,1/5",error=50,sensor_area=["0.01 mm","10 mm"]}'
+    ended = ommatid("design", "tile19", "--set", "noise.variance=1", "--set", table)
+    assert (ended.code, "none fits the sensor" in ended.err) == (2, True), ended.err
+
+
+def test_bits_that_miss_a_wish_are_said(ommatid: Command) -> None:
+    table = 'design={magnifications="1/3,1/4,1/5",error=50,bits=[2,12]}'
+    assert "an error of 50 is out of reach" in ommatid("design", "tile19", "--set", table).out
 
 
 def test_cameras_of_real_lenses_are_those_of_the_scene_s_target() -> None:

@@ -107,6 +107,8 @@ REFUSED = {
     "leave it out, or -o and --steer": (("--steer", "1,1,2,2", "--candidates", "1/2"), ()),
     "got no place for them": (("--steer", "1,1,2,2"), ("design.window=[9,9]",)),
     "cameras in their places": (("--steer", "1,1,2,2"), ('camera.tolerance={position="1 um"}',)),
+    "without surfaces and distortion": (("--steer", "1,1,2,2"), ("camera.lens.I.distortion=[0.01,0]",)),
+    "knows noise and prior": (("--steer", "1,1,2,2"), ("estimator.prior_variance=1000",)),
     "set noise.variance": (("--steer", "1,1,2,2"), ("noise=",)),
 }
 
@@ -117,6 +119,27 @@ def test_impossible_windows_are_refused_in_one_sentence(words: str, ommatid: Com
     ended = ommatid("design", "tile19", *options, *(each for change in sets for each in ("--set", change)))
     assert (ended.code, words in ended.err) == (2, True), ended.err
     assert len(ended.err.splitlines()) == 1
+
+
+def test_windows_whose_patches_overlap_are_refused(here: Path, ommatid: Command) -> None:
+    changes = 'camera.lens_pitch="0.03 mm"', "camera.lens.I.pixels=[3,3]", "design.windows=10"
+    sets = [each for change in changes for each in ("--set", change)]
+    ended = ommatid("design", "tile19", "--lens", "I", *sets, "--steer", "0,0,2,19", "-o", "next")
+    assert (ended.code, "overlap" in ended.err) == (2, True), ended.err
+    assert not (here / "next").exists()
+
+
+def test_a_steered_camera_is_steered_again() -> None:
+    once = steer(tile(19, "design={windows=1,window=[3,3]}"), np.ones((19, 19)))
+    twice = steer(once.scene, np.ones((19, 19)))
+    names = [lens.name for lens in twice.scene.camera.lens]
+    assert len(set(names)) == len(names) > len(once.scene.camera.lens)
+    assert twice.errors[-1] < once.errors[-1]
+
+
+def test_windows_take_the_same_noise_everywhere(ommatid: Command) -> None:
+    ended = ommatid("design", "sensor", "--set", "target.detail=1", "--steer", "1,1,2,2")
+    assert (ended.code, "got a [sensor]" in ended.err) == (2, True), ended.err
 
 
 def test_weights_of_another_shape_are_refused() -> None:

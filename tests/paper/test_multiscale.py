@@ -75,6 +75,8 @@ def test_the_error_of_sums_is_that_of_averages_of_less_noise() -> None:
 def test_sums_take_an_ideal_sensor(ommatid: Command) -> None:
     ended = ommatid("predict", "sensor", "--set", "camera.binning=sum")
     assert (ended.code, "got a [sensor]" in ended.err) == (2, True)
+    ended = ommatid("predict", "tile19", "--set", "camera.binning=sum", "--set", "noise.bits=8")
+    assert (ended.code, "full scale of noise.bits" in ended.err) == (2, True)
 
 
 def test_a_run_of_sums_is_inside_its_interval(here: Path, ommatid: Command) -> None:

@@ -109,7 +109,7 @@ class DesignSpace:
         return BestCamera(self, budget, mixture, tuple(whole))
 
     def cheapest(self, error: float) -> tuple[float, BestCamera]:
-        """Return a cost below which no mixture has so small an error, and the camera of least cost that has it.
+        """Return a cost below which no mixture has so small an error, and cameras of nearly the least that have it.
 
         Raises InputError, which names the least error within reach, if none has.
         """

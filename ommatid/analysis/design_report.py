@@ -41,16 +41,16 @@ class FrontPoint:
         return 0.0 if self.camera is None else self.best.space.cost(self.camera)
 
 
-def front(space: DesignSpace, bits: int | None) -> Iterator[FrontPoint]:
-    """Yield the best cameras of several costs, then of several depths at the scene's cost."""
+def front(space: DesignSpace, bits: int | None, budget: float) -> Iterator[FrontPoint]:
+    """Yield the best cameras of several costs around a budget, then of several depths for this budget."""
     least, deepest = float(space.groups.costs.min()), float(space.depths.max())
     for share in SHARES:
-        if share * space.budget >= least:
-            yield FrontPoint(bits, "cost", deepest, space.best(share * space.budget, 1, NEARLY))
+        if share * budget >= least:
+            yield FrontPoint(bits, "cost", deepest, space.best(share * budget, 1, NEARLY))
     for depth in sorted(set(space.depths.round(9).tolist())):
         thinner = space.thinner(depth)
-        if thinner.types and space.budget >= float(thinner.groups.costs.min()):
-            yield FrontPoint(bits, "depth", depth, thinner.best(space.budget, 1, NEARLY))
+        if thinner.types and budget >= float(thinner.groups.costs.min()):
+            yield FrontPoint(bits, "depth", depth, thinner.best(budget, 1, NEARLY))
 
 
 def words_of(amounts: Sequence[float], space: DesignSpace) -> str:
@@ -180,9 +180,9 @@ def draw_front(path: Path, points: Sequence[FrontPoint], best: BestCamera, files
         mixtures = [(point.best.budget, point.best.mixture.found.error) for point in by_limit["cost"]]
         made = [(point.cost, each.found.error) for point in by_limit["cost"] if (each := point.camera)]
         thin = [(point.depth, each.found.error) for point in by_limit["depth"] if (each := point.camera)]
-        by_cost.plot(*np.transpose(mixtures), label=f"{label}best mixture", **style)
-        by_cost.plot(*np.transpose(made), "o", label=f"{label}whole arrays", **style)
-        by_depth.plot(*np.transpose(thin), "o-", drawstyle="steps-post", label=f"{label}whole arrays", **style)
+        _draw_line(by_cost, mixtures, "-", label=f"{label}best mixture", **style)
+        _draw_line(by_cost, made, "o", label=f"{label}whole arrays", **style)
+        _draw_line(by_depth, thin, "o-", drawstyle="steps-post", label=f"{label}whole arrays", **style)
     space, own = best.space, best.space.own
     if own is not None:
         by_cost.plot(space.cost(own), own.found.error, "k*", markersize=11, label="this camera")
@@ -195,6 +195,10 @@ def draw_front(path: Path, points: Sequence[FrontPoint], best: BestCamera, files
     _draw_arrays(arrays, best)
     _draw_waves(waves, best)
     files.replace(figure, path)
+
+
+def _draw_line(axes: Any, points: Sequence[tuple[float, float]], form: str, **style: Any) -> None:
+    axes.plot([x for x, _ in points], [y for _, y in points], form, **style)
 
 
 def _sentence(best: BestCamera) -> str:

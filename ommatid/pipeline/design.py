@@ -81,7 +81,7 @@ def prove_best_camera(
     lines += design_report.rows(best, with_edges)
     lines += missed + [design_report.bits_row(bits, each) for bits, each in found.items() if bits is not None]
     if folder is not None:
-        points = [point for bits, space in spaces.items() for point in design_report.front(space, bits)]
+        points = [point for bits, each in found.items() for point in design_report.front(each.space, bits, each.budget)]
         make_folder(folder)
         files = dict[tuple[int | None, str], str]()
         for number, (each, camera) in enumerate(zip(best.whole, made, strict=True), 1):

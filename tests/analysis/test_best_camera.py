@@ -278,6 +278,13 @@ def test_small_sensors_have_cameras_or_none(size: str, ommatid: Command) -> None
     assert ("none fit the sensor" in ended.out) is (size == '["0.02 mm","0.6 mm"]')
 
 
+def test_a_front_without_a_camera_is_drawn(here: Path, ommatid: Command) -> None:
+    changes = "--set", "noise.variance=1", "--set", 'design.sensor_area=["0.02 mm","0.6 mm"]'
+    ended = ommatid("design", "tile19", *changes, "--set", 'design.magnifications="1/3,1/4"', "-o", "none")
+    assert ended.code == 0, ended.err
+    assert {path.name for path in (here / "none").iterdir()} == {"front.csv", "front.png"}
+
+
 def test_a_wish_that_fits_no_sensor_says_so(ommatid: Command) -> None:
     table = 'design={magnifications="1/3,1/4,1/5",error=50,sensor_area=["0.01 mm","10 mm"]}'
     ended = ommatid("design", "tile19", "--set", "noise.variance=1", "--set", table)

@@ -336,7 +336,8 @@ def _bands(scene: Scene, types: Sequence[LensCandidate]) -> Bands:
     if scene.sensor is None:
         return bands
     alone = [_weights(_task(scene, scene, [each]))[0] for each in types]
-    weights = [each * own / here for each, own, here in zip(bands.weights, alone, _weights(task), strict=True)]
+    together = zip(bands.weights, alone, _weights(task), strict=True)
+    weights = [each * own / here if here > 0 else 0.0 for each, own, here in together]
     return replace(bands, weights=tuple(weights))
 
 

@@ -165,6 +165,8 @@ def best_mixture(groups: WaveGroups, budget: float, tight: float = TIGHT, most: 
     costs = groups.costs
     mixture = _mixture(groups, budget, budget / costs / costs.size)
     bound = mixture.bound
+    if not mixture.found.gains.any():
+        return mixture  # no reading tells anything, as where all are saturated
     for number in range(most + 1):
         for _ in range(STEPS):
             steps = mixture.amounts * np.sqrt(mixture.found.gains / costs)

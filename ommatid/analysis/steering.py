@@ -24,9 +24,9 @@ from scipy import sparse
 
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
 from ommatid.reconstruct.assumptions import assumptions_at
-from ommatid.reconstruct.frame.variance_map import prior_precision
 from ommatid.reconstruct.method_choice import MethodChoice
 from ommatid.reconstruct.methods.method import EstimationTask, Execution
+from ommatid.reconstruct.prior import reflecting_root
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import one_thread
@@ -101,13 +101,13 @@ def steer(scene: Scene, weights: FloatArray) -> SteeredCamera:
             sparse.diags_array(task.on_all_measurements(task.expected_noise, np.inf) ** -0.5) @ rows
         )
         own = whitened[: camera.measurements]
-        information = np.asarray((own.T @ own).todense())
-        covariance = np.linalg.inv(information + _prior_precision(task)).astype(np.float64)
+        root = _posterior_root(task, own)
+        covariance = root @ root.T
         share = (weights / weights.sum()).ravel()
         slices = wider.slices()[len(camera.sub_imagers) :]
         blocks = [whitened[part] for part in slices]
         chosen, errors, after = _greedy(covariance, share, blocks, table.windows)
-        bound = _bound(covariance, share, blocks, table.windows)
+        bound = _bound(root, share, blocks, table.windows)
     subs = wider.sub_imagers[len(camera.sub_imagers) :]
     windows = tuple(PlacedWindow(subs[index].type.name.removeprefix(PLACES), subs[index].window) for index in chosen)
     variances = np.array([np.diag(covariance), after]).reshape(2, *camera.shape)
@@ -187,11 +187,21 @@ def _task(scene: Scene) -> EstimationTask:
     return assumptions_at(recording.stack, recording.model, choice, recording.image, Execution(quick=True)).method.task
 
 
-def _prior_precision(task: EstimationTask) -> FloatArray:
+def _posterior_root(task: EstimationTask, rows: sparse.csr_array) -> FloatArray:
+    """Return R with R R^T the posterior covariance of whitened rows of H, (N, N), by singular values.
+
+    With P = L L^T they are those of the rows times L: however large, they leave the digits of the small ones.
+    """
     precision = task.precision_on(task.shape)
     if not isinstance(precision, np.ndarray):
-        return precision * np.eye(task.shape[0] * task.shape[1])
-    return prior_precision(precision, task.shape)
+        prior = np.eye(rows.shape[1]) / precision**0.5
+    else:
+        prior = reflecting_root(1 / precision)
+    seen: FloatArray = np.asarray(rows @ prior)
+    if len(seen) < rows.shape[1]:
+        seen = np.concatenate([seen, np.zeros((rows.shape[1] - len(seen), rows.shape[1]))])
+    _, values, turned = np.linalg.svd(seen, full_matrices=False)
+    return np.asarray((prior @ turned.T) / np.hypot(1.0, values), dtype=np.float64)
 
 
 def _greedy(
@@ -213,9 +223,8 @@ def _greedy(
     return chosen, errors, np.diag(covariance)
 
 
-def _bound(covariance: FloatArray, share: FloatArray, blocks: Sequence[sparse.csr_array], count: int) -> float:
-    """Return a weighted error that no choice of so many windows falls below."""
-    root = np.linalg.cholesky(covariance)
+def _bound(root: FloatArray, share: FloatArray, blocks: Sequence[sparse.csr_array], count: int) -> float:
+    """Return a weighted error that no choice of so many windows falls below; root : R of the covariance R R^T."""
     rows: FloatArray = np.concatenate([np.asarray(block @ root) for block in blocks])
     counted = share > 0
     owners = np.repeat(np.arange(len(blocks)), [block.shape[0] for block in blocks])

@@ -278,6 +278,13 @@ def test_small_sensors_have_cameras_or_none(size: str, ommatid: Command) -> None
     assert ("none fit the sensor" in ended.out) is (size == '["0.02 mm","0.6 mm"]')
 
 
+@pytest.mark.parametrize("scene_and_key", ["tile19 noise.saturation=20", "sensor sensor.saturation=65"])
+def test_cameras_whose_readings_are_saturated_have_the_error_of_the_prior(scene_and_key: str, ommatid: Command) -> None:
+    name, key = scene_and_key.split()
+    found = document(ommatid("design", name, "--set", key, "--set", 'design.magnifications="1/3,1/4"', "--json"))
+    assert found["bound"] <= found["mixture"]["mse"]
+
+
 def test_a_front_without_a_camera_is_drawn(here: Path, ommatid: Command) -> None:
     changes = "--set", "noise.variance=1", "--set", 'design.sensor_area=["0.02 mm","0.6 mm"]'
     ended = ommatid("design", "tile19", *changes, "--set", 'design.magnifications="1/3,1/4"', "-o", "none")

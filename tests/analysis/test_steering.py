@@ -129,6 +129,16 @@ def test_windows_whose_patches_overlap_are_refused(here: Path, ommatid: Command)
     assert not (here / "next").exists()
 
 
+@pytest.mark.parametrize("noise", ["1e-2", "1e-7"])
+def test_windows_of_a_nearly_exact_camera_have_the_predicted_error(noise: str) -> None:
+    """Where variances are of so different size that an inverse, or a root by Cholesky, would leave no digits."""
+    changes = "camera.binning=sum", 'camera.pixel_blur="3 um"', "design={windows=1,window=[2,2]}"
+    described = read(GALLERY / "tile19.toml", (f"noise.variance={noise}", *changes))
+    steered = steer(described, np.ones((19, 19)))
+    assert steered.before == pytest.approx(predict_scene(described, rays=False).mse, rel=1e-6)
+    assert 0 < steered.bound <= steered.errors[-1] < steered.before
+
+
 def test_a_steered_camera_is_steered_again() -> None:
     once = steer(tile(19, "design={windows=1,window=[3,3]}"), np.ones((19, 19)))
     twice = steer(once.scene, np.ones((19, 19)))

@@ -55,7 +55,6 @@ from .sampling.passes import (
     samples_within,
 )
 from .sampling.sample_law import LEAPS, SampleLaw
-from .sensors import response
 from .world_view import rendered_world
 
 if TYPE_CHECKING:
@@ -435,6 +434,8 @@ def allowed_variance(setup: Setup) -> AllowedVariance:
     if sensor is None:
         known = 0.0 if noise is None else noise.variance + noise.quantisation_variance
         return lambda _, rows: SHARE * known / np.square(received[rows])
+    from .sensors import response
+
     electrons = response(setup)
     level = flat_values(sensor, setup.camera, electrons)
 

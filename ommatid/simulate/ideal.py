@@ -22,7 +22,6 @@ from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import Model, designed_observation, fitted_model, is_stored
-from ommatid.scenes.optics import blur, footprints
 from ommatid.scenes.optics.boxes import overlap
 from ommatid.scenes.pose import pose_of, poses
 from ommatid.scenes.scene import Scene
@@ -60,6 +59,8 @@ def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
 
         return surface_matrix.matrix(camera, lens_type)
     if lens_type.optics.distortion is not None or lens_type.is_rotated:
+        from ommatid.scenes.optics import footprints
+
         if blurred:
             raise InputError(
                 f"camera.lens.{lens_type.name}: distortion or a rotated sub-imager with defocus, diffraction or"
@@ -67,6 +68,8 @@ def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
             )
         parts = [footprints.sub_matrix(camera, sub, pose_of(sub)) for sub in subs]
     elif blurred:
+        from ommatid.scenes.optics import blur
+
         return blur.matrix(camera, lens_type, *blur.blurs_of(camera, lens_type))
     else:
         parts = [sub_matrix(camera, sub) for sub in subs]
@@ -94,6 +97,8 @@ def true_matrix(camera: Camera) -> sparse.csr_array:
         raise InputError(
             "misaligned lenses with surfaces, defocus, diffraction or pixel_blur have no closed form; calibrate them"
         )
+    from ommatid.scenes.optics import footprints
+
     return footprints.matrix(camera, poses(camera))
 
 
@@ -132,6 +137,8 @@ def designed_kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
         return surface_kernels.kernels(camera, lens_type)
     if lens_type.steered:
         raise InputError(f"camera.lens.{lens_type.name}: sub-imagers off the grid have kernels of their own")
+    from ommatid.scenes.optics import blur
+
     exact = blur.kernels(camera, lens_type)
     return replace(exact, shapes=KernelShapes.low_rank(exact.shapes.kernels, exact.places.width))
 

@@ -32,7 +32,6 @@ from ommatid.scenes.tables.sensor import SensorTable
 from .renderer.variant import choose, release
 from .sampling.checkpoint import Checkpoint, State, open_checkpoint
 from .sampling.passes import OverPasses, Plan, Rendering, Tally, plan, rounding_variance
-from .sensors import expose, generators, record, response
 from .world_view import rendered_world
 
 if TYPE_CHECKING:
@@ -156,11 +155,15 @@ def exposed(setup: Setup, light: FloatArray, variance: FloatArray, record: dict[
         recording = _recording(setup, scene.sensor, light)
         return stack_from_recording(setup.resolved, camera, recording, variance, record)
     if scene.noise is not None:
+        from .sensors import expose, generators
+
         values = expose(values, scene.noise, generators(camera, scene.render.seed), camera.slices())
     return Stack(setup.resolved, camera, values, variance, record)
 
 
 def _recording(setup: Setup, sensor: SensorTable, light: FloatArray) -> Recording:
+    from .sensors import record, response
+
     dark = np.isnan(light)  # no light can reach these pixels, so their flat frame marks them as dead
     electrons = np.where(dark, 0.0, response(setup))
     shot = negligible_shot_noise(setup.scene, setup.camera) is None

@@ -10,13 +10,9 @@ from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import DEVIATIONS
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.blur import blur_of
-from ommatid.scenes.optics.distortion import largest_field
 from ommatid.scenes.setup import Setup
 
 from .adaptive_render import check_noise_target
-from .lenses.prescription import prescription_of
-from .lenses.wavefront import GRID_REACH
 from .renderer.variant import check_fast_variant, check_transport_variant, choose
 from .world_view import check_world
 
@@ -59,8 +55,12 @@ def check_lenses(camera: Camera) -> None:
     """Raise InputError for surfaces that form no image, and for distortion that folds the image."""
     for lens_type in camera.types:
         if lens_type.optics.surfaces is not None:
+            from .lenses.prescription import prescription_of
+
             prescription_of(camera, lens_type)
         if lens_type.optics.distortion is not None:
+            from ommatid.scenes.optics.distortion import largest_field
+
             largest_field(camera, lens_type)
 
 
@@ -84,12 +84,17 @@ def _visible_pixels(camera: Camera, lens_type: LensType) -> int:
     if lens_type.optics.surfaces is not None:
         side += 2 * ceil(_diffraction_reach(camera, lens_type) + DEVIATIONS * camera.diffusion(lens_type))
     elif camera.is_blurred(lens_type):
+        from ommatid.scenes.optics.blur import blur_of
+
         side += 2 * ceil(blur_of(camera, lens_type).reach)
     return side**2
 
 
 def _diffraction_reach(camera: Camera, lens_type: LensType) -> float:
     """How far, in pixels of f, the point-spread function of surfaces is computed in focus."""
+    from .lenses.prescription import prescription_of
+    from .lenses.wavefront import GRID_REACH
+
     depth = camera.depth(lens_type)
     working = prescription_of(camera, lens_type).working_f_number(depth)
     return (

@@ -24,7 +24,6 @@ from ..sampling.checkpoint import Checkpoint
 from ..sampling.passes import Plans, rounding_variance
 from ..validation import check_entries
 from .fit.chart import SIDE
-from .fit.fit import calibrate_by_fit, has_chart
 from .responses import Responses, Subsets, measured, same_plans
 
 
@@ -55,6 +54,8 @@ def rendered_model(
         return entry_variances(responses, camera, 1 if float64 else responses.samples)
 
     if fits(setup):
+        from .fit.fit import calibrate_by_fit
+
         rays = {name: work.total for name, work in (plans or same_plans(setup)).items()}
         views_alone = scene.calibration.fit == "geometry"
         fit = calibrate_by_fit(setup.simulated, measure, variances, rays, with_kernels=not views_alone)
@@ -155,5 +156,7 @@ def explains(setup: Setup) -> bool:
     """Return True if few numbers are expected to explain all of H."""
     if not fits(setup):
         return False
+    from .fit.fit import has_chart
+
     with_kernels = setup.scene.calibration.fit != "geometry"
     return all(has_chart(setup.simulated, lens, with_kernels) for lens in setup.simulated.types)

@@ -15,8 +15,6 @@ from ommatid.scenes.setup import Setup
 from ..renderer.variant import check_transport_variant, choose
 from ..sampling.checkpoint import Checkpoint
 from ..sampling.passes import OverPasses, Plans, plan
-from .point_sources import rows_from_points
-from .ray_transport import rows_from_rays
 
 Subsets = dict[str, IntArray | None]  # pixels of a lens type, None: all, by its name
 
@@ -58,8 +56,12 @@ def measured(
     chosen: Subsets = dict.fromkeys(renderer.groups) if subsets is None else subsets
     every = [renderer.pixels(group, chosen[group]) for group in renderer.groups if group in chosen]
     if by_points:
+        from .point_sources import rows_from_points
+
         parts = rows_from_points(renderer, every, plans, seed, progress, checkpoint)
     else:
+        from .ray_transport import rows_from_rays
+
         check_transport_variant(variant)
         every = [block for pixels in every for block in renderer.blocks(pixels, plans[pixels.group].samples)]
         parts = rows_from_rays(renderer, every, plans, seed, progress)

@@ -16,7 +16,6 @@ from typing import Any
 
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.distortion import largest_field, undistort
 
 from .loaded import dr, mi
 
@@ -61,6 +60,8 @@ class LensModel:
         self._distortion = lens_type.optics.distortion
         self._corner = camera.distance_of(lens_type) / camera.half_diagonal
         if self._distortion is not None:
+            from ommatid.scenes.optics.distortion import largest_field
+
             self._limit = largest_field(camera, lens_type)
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
@@ -80,6 +81,8 @@ class LensModel:
         slopes = through_centre(x, y, depth)
         if self._distortion is None:
             return slopes
+        from ommatid.scenes.optics.distortion import undistort
+
         return undistort(*slopes, *self._distortion, self._corner, self._limit)
 
 

@@ -19,18 +19,14 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.blur import blurs_of
 from ommatid.scenes.pose import PixelPlaces
 from ommatid.scenes.tables.estimation import Sampler
 
 from ..sampling.passes import Plan
 from ..sampling.samplers import RELATED_DRAWS, fitting
-from .crosstalk import Crosstalk
-from .diffracting_lens import DiffractingLens
 from .draws import GridDraws, ReseededSampler
 from .lens import Distance, LensModel, ThinLens
 from .loaded import dr, mi
-from .real_lens import real_lens
 from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
 
 MOST_RAYS = 2**24  # that start together: some hundred bytes each
@@ -104,6 +100,8 @@ class RayGenerator:
         self._blur = types[0].optics.pixel_blur
         self._crossing = None
         if not camera.walls:
+            from .crosstalk import Crosstalk
+
             models = {lens_type.name: lens_of(camera, lens_type) for lens_type in camera.types}
             self._crossing = Crosstalk(camera, models)
 
@@ -188,11 +186,17 @@ class RayGenerator:
 def lens_of(camera: Camera, lens_type: LensType) -> LensModel:
     """Create the lens model of a lens type."""
     if lens_type.optics.surfaces is not None:
+        from .real_lens import real_lens
+
         return real_lens(camera, lens_type)
     aperture = lens_type.optics.aperture
     if aperture is None:
         return LensModel(camera, lens_type)
-    # Not so far out of focus that light is rays.
-    if camera.wavelengths and any(blur.airy for blur, _ in blurs_of(camera, lens_type)):
-        return DiffractingLens(camera, lens_type, aperture)
+    if camera.wavelengths:
+        from ommatid.scenes.optics.blur import blurs_of
+
+        if any(blur.airy for blur, _ in blurs_of(camera, lens_type)):  # not so far out of focus that light is rays
+            from .diffracting_lens import DiffractingLens
+
+            return DiffractingLens(camera, lens_type, aperture)
     return ThinLens(camera, lens_type, aperture)

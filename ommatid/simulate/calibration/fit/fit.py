@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import special
@@ -24,10 +24,12 @@ from ommatid.scenes.fitted.view import UNITS, designed
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import MeasuredRows
 
-from ...kernel_fit.kernel_fit import KernelFit, fit_kernels, refusal
 from ..responses import Responses, Subsets
 from .chart import ChartRows, chart_of, chart_rows, freedom_of, side_for_kernels
 from .view_fit import SIGNIFICANCE, ViewFit, fit_views, predicted
+
+if TYPE_CHECKING:
+    from ...kernel_fit.kernel_fit import KernelFit
 
 FEW = 8  # rays of a cell, below which its weight hardly grows: single rays there would decide
 STRAY = 0.5  # rays that each cell may miss or have in excess, by rounding of positions to float32
@@ -100,6 +102,8 @@ def has_chart(camera: Camera, lens_type: LensType, with_kernels: bool = True) ->
     """Return True if few numbers may explain a lens type, so that a chart of its pixels is measured first."""
     if is_sharp(camera, lens_type) or not with_kernels:
         return is_sharp(camera, lens_type)
+    from ...kernel_fit.kernel_fit import refusal
+
     return not refusal(camera, lens_type)
 
 
@@ -172,6 +176,8 @@ def _fit_type(
     if not charted:
         return _TypeFit(views_as_designed(subs, explained=False), None, [])
     if not is_sharp(camera, lens):
+        from ...kernel_fit.kernel_fit import fit_kernels
+
         kernels = fit_kernels(responses, camera, lens, _chart(camera, lens))
         return _TypeFit(views_as_designed(subs, kernels.accepted), None, [], kernels)
     pointers = responses.matrix.indptr

@@ -27,7 +27,7 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene, parse, with_tables
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.tables.estimation import DesignTable
+from ommatid.scenes.tables.estimation import DesignTable, PriorTable
 
 from .design import LensCandidate, check_detail
 from .mixture import TIGHT, Evaluation, Mixture, WaveGroups, WholeMixture, best_mixture, best_whole
@@ -204,7 +204,8 @@ def design_space(scene: Scene, wanted: Sequence[LensCandidate]) -> DesignSpace:
     if not types:
         raise _impossible(scene, refused)
     with one_thread():
-        bands, kept, others = _possible(scene, list(types))
+        prior, _ = prior_without_stack(Setup.from_scene(scene).calibrated)
+        bands, kept, others = _possible(scene, prior, list(types))
         depths, cells = np.array([types[each] for each in kept]).T
         area = _area(scene)
         sides = np.array([each.side for each in kept])
@@ -317,7 +318,7 @@ def _own_arrays(camera: Camera) -> Counter[LensCandidate]:
     return found
 
 
-def _bands(scene: Scene, types: Sequence[LensCandidate]) -> Bands:
+def _bands(scene: Scene, prior: PriorTable, types: Sequence[LensCandidate]) -> Bands:
     """Return the transfer functions of a camera of all types.
 
     They are those in front of the scene's target or, where that is small or very large, of a square of pixels. What
@@ -329,28 +330,31 @@ def _bands(scene: Scene, types: Sequence[LensCandidate]) -> Bands:
         tables = scene.plain()
         tables["target"] = {key: each for key, each in tables["target"].items() if key not in ("image", "origin")}
         shown = parse({**tables, "target": {**tables["target"], "shape": [side, side]}}, scene.source)
-    task = _task(shown, scene, types)
+    task = _task(shown, prior, types)
     bands = frame_system(task).bands
     if bands is None:
         raise InputError(f"{scene.source}: the bound is that of lenses that see the same everywhere")
     if scene.sensor is None:
         return bands
-    alone = [_weights(_task(scene, scene, [each]))[0] for each in types]
+    alone = [_weights(_task(scene, prior, [each]))[0] for each in types]
     together = zip(bands.weights, alone, _weights(task), strict=True)
     weights = [each * own / here if here > 0 else 0.0 for each, own, here in together]
     return replace(bands, weights=tuple(weights))
 
 
-def _task(scene: Scene, original: Scene, types: Sequence[LensCandidate]) -> EstimationTask:
-    """Return what the estimator of a camera of these types is given; original : the scene whose prior it is."""
-    camera, tables = derive(original), scene.plain()
-    prior, _ = prior_without_stack(Setup.from_scene(original).calibrated)
+def _task(scene: Scene, prior: PriorTable, types: Sequence[LensCandidate]) -> EstimationTask:
+    """Return what the estimator of a camera of these types is given, apart far enough for any of them."""
+    tables, camera = scene.plain(), scene.camera
     width = max((max(derive(scene).shape) + each.ratio) / each.ratio for each in types) * camera.pixel_pitch
     tables["camera"] = {key: each for key, each in tables["camera"].items() if key not in ("sensor", "lens_pitch")}
     tables["camera"]["lens_pitch"] = f"{max(float(width), camera.lens_pitch)!r} mm"
     tables["estimator"] = {**tables.get("estimator", {}), "method": "frame"}
-    setup = Setup.from_scene(with_tables(scene_of(parse(tables, scene.source), types), prior=prior))
-    recording, choice = recording_without_rays(setup), MethodChoice("frame", "", 0, 0.0)
+    return frame_task(with_tables(scene_of(parse(tables, scene.source), types), prior=prior))
+
+
+def frame_task(scene: Scene) -> EstimationTask:
+    """Return what the estimator of a scene's frame is given, of a perfect H and a perfect rendering."""
+    recording, choice = recording_without_rays(Setup.from_scene(scene)), MethodChoice("frame", "", 0, 0.0)
     return assumptions_at(recording.stack, recording.model, choice, recording.image, Execution(quick=True)).method.task
 
 
@@ -360,27 +364,29 @@ def _weights(task: EstimationTask) -> list[float]:
     return [float(weights[rows].mean()) for rows in task.model.camera.type_slices()]
 
 
-def _possible(scene: Scene, types: Sequence[LensCandidate]) -> tuple[Bands, list[LensCandidate], dict[str, str]]:
+def _possible(
+    scene: Scene, prior: PriorTable, types: Sequence[LensCandidate]
+) -> tuple[Bands, list[LensCandidate], dict[str, str]]:
     """Return the transfer functions of the lens types that the camera can have, these types, and why not the others.
 
     Raises InputError if it can have none.
     """
     refused: dict[str, str] = {}
     try:
-        return _bands(scene, types), list(types), refused
+        return _bands(scene, prior, types), list(types), refused
     except InputError as error:
         if len(types) == 1:
             raise InputError(f"{scene.source}: {types[0].words}: {_reason(scene, error)}") from error
     kept: list[LensCandidate] = []
     for each in types:
         try:
-            _bands(scene, [each])
+            _bands(scene, prior, [each])
             kept.append(each)
         except InputError as error:
             refused[each.words] = _reason(scene, error)
     if not kept:
         raise _impossible(scene, refused)
-    return _bands(scene, kept), kept, refused
+    return _bands(scene, prior, kept), kept, refused
 
 
 def _impossible(scene: Scene, refused: dict[str, str]) -> InputError:

@@ -23,9 +23,7 @@ import numpy as np
 from scipy import sparse
 
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
-from ommatid.reconstruct.assumptions import assumptions_at
-from ommatid.reconstruct.method_choice import MethodChoice
-from ommatid.reconstruct.methods.method import EstimationTask, Execution
+from ommatid.reconstruct.methods.method import EstimationTask
 from ommatid.reconstruct.prior import reflecting_root
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -33,12 +31,10 @@ from ommatid.runtime.machine import one_thread
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene, parse
-from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import DesignTable
 
-from .best_camera import check_known
+from .best_camera import check_known, frame_task
 from .mixture import WaveGroups, best_mixture
-from .predicted_recording import recording_without_rays
 
 MOST_ENTRIES = 30_000_000  # of H of all windows, stored with its zeros
 TIGHT, EXCHANGES = 0.01, 10  # gap of the bound relative to the error, and exchanges, at which its steps end
@@ -95,7 +91,7 @@ def steer(scene: Scene, weights: FloatArray) -> SteeredCamera:
     _check(scene, camera, weights)
     with one_thread():
         places = _places(scene, camera, table)
-        task = _task(places)
+        task = frame_task(places)
         wider, rows = task.model.camera, task.model.to_sparse()
         whitened = sparse.csr_array(
             sparse.diags_array(task.on_all_measurements(task.expected_noise, np.inf) ** -0.5) @ rows
@@ -179,12 +175,6 @@ def _optics_of(scene: Scene, name: str) -> dict[str, Any]:
     """Return the table of a lens type without its array and windows."""
     (table,) = (each for each in scene.plain()["camera"]["lens"] if each["name"] == name)
     return {key: each for key, each in table.items() if key not in ("step", "sub_imager")}
-
-
-def _task(scene: Scene) -> EstimationTask:
-    recording = recording_without_rays(Setup.from_scene(scene))
-    choice = MethodChoice("frame", "", 0, 0.0)
-    return assumptions_at(recording.stack, recording.model, choice, recording.image, Execution(quick=True)).method.task
 
 
 def _posterior_root(task: EstimationTask, rows: sparse.csr_array) -> FloatArray:

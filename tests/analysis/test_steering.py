@@ -10,7 +10,6 @@ import pytest
 
 from ommatid.analysis.predict import predict_scene
 from ommatid.analysis.steering import steer, weights_of
-from ommatid.pipeline.descriptions import describe_scene
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import Scene, read
@@ -87,7 +86,6 @@ def test_windows_for_a_region_save_readings() -> None:
     near, everywhere = steer(described, weights), steer(described, np.ones((19, 19)))
     assert near.errors[-1] < float((everywhere.variances[1] * weights).sum() / weights.sum())
     assert near.errors[-1] == pytest.approx(error_of(near.scene, weights), rel=1e-9)
-    assert describe_scene(near.scene)["camera"]
 
 
 def test_the_command_places_windows_for_a_region_and_for_a_run(here: Path, ommatid: Command) -> None:

@@ -22,6 +22,7 @@ import typer.main
 from pydantic import BaseModel
 
 from ommatid.cli.app import app
+from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.scenes import scene
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats import exr
@@ -245,9 +246,15 @@ def undocumented(folder: Path) -> list[str]:
     with zipfile.ZipFile(folder / "model.npz") as file:
         stored = [re.sub(r"^(views|kernels)\.[^.]+\.", r"\1.NAME.", name) for name in file.namelist()]
         missing += [name for name in stored if name.removesuffix(".npy") not in arrays]
-    keys = set(code_spans(section(page, "`run.json`")))
+    keys = {key for row in rows_of_run_json() for key in row}
     document = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     return missing + [key for key in leaves(document) if not is_documented(key, keys)]
+
+
+def rows_of_run_json() -> list[list[str]]:
+    """Return the keys of every row of the table in docs/files.md: those on the left, then those below each of them."""
+    rows = [list(map(code_spans, row)) for row in table_rows(section(DOCS / "files.md", "`run.json`"))]
+    return [left + [f"{key}.{name}" for key in left for name in right] for left, right in rows]
 
 
 def leaves(document: Any, prefix: str = "") -> Iterator[str]:
@@ -271,6 +278,15 @@ DOCUMENTED_AS_ONE = (  # keys whose contents are not listed one by one
 
 def is_documented(key: str, keys: set[str]) -> bool:
     return key in keys or any(key.startswith(f"{parent}.") and parent in keys for parent in DOCUMENTED_AS_ONE)
+
+
+def test_files_page_has_the_keys_of_run_json() -> None:
+    """Of every field of the report; those of the stages and of the fitted numbers are the same for each."""
+    known = {key for key, _ in fields(RunReport)}
+    rows = [[re.sub(r"^(stages|diagnostics\.fit)\.\w+", r"\1", key) for key in row] for row in rows_of_run_json()]
+    assert {row[0] for row in rows} <= known
+    documented = {".".join(key.split(".")[:count]) for row in rows for key in row for count in range(1, 4)}
+    assert known - documented == set()
 
 
 def test_files_and_keys_of_a_run_are_documented(finished: Path) -> None:

@@ -48,6 +48,7 @@ for command in (
     calibrate.calibrate,
     reconstruct.reconstruct,
     reconstruct.report,
+    reconstruct.figure,
     reconstruct.check,
 ):
     with_arguments()(command)

@@ -164,13 +164,10 @@ def figure_files(formats: str, resolution: int, always: str = "png") -> FigureFi
     return FigureFiles(tuple(dict.fromkeys((always, *(figure_formats(formats) if formats else ())))), resolution)
 
 
-def regions(texts: list[str] | None) -> tuple[tuple[tuple[int, int], tuple[int, int]], ...]:
-    """Read the corner and the size of every `--region`. Raises InputError."""
-    corners_and_sizes: list[tuple[tuple[int, int], tuple[int, int]]] = []
-    for text in texts or ():
-        row, column, rows, columns = _integers("--region", text, "ROW,COLUMN,ROWS,COLUMNS", "8,8,4,4")
-        corners_and_sizes.append(((row, column), (rows, columns)))
-    return tuple(corners_and_sizes)
+def region(option: str, text: str) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Read the corner and the size of a part of the target. Raises InputError."""
+    row, column, rows, columns = _integers(option, text, "ROW,COLUMN,ROWS,COLUMNS", "8,8,4,4")
+    return (row, column), (rows, columns)
 
 
 def acquisition(

@@ -1,4 +1,4 @@
-"""The commands that need no scene file: reconstruct, of one stack or of several of one camera, report and check."""
+"""The commands on files that need no scene file: reconstruct, of one or several stacks, report, figure and check."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.printable import printable_sentence
 
 from . import failures, options, output
-from .options import Force, Formats, Json, Lenses, Quiet, Sets, Strict, Verbose
+from .options import FigureResolution, Force, Formats, Json, Lenses, Output, Quiet, Sets, Strict, Verbose
+
+SLIDE = 300  # dots per inch
 
 if TYPE_CHECKING:
     from ommatid.batch.frames import Frame, FrameOptions
@@ -75,6 +77,20 @@ ScenePrior = Annotated[
         "--scene-prior", help="Assume the scene's prior (default: an independent one is replaced by a fitted one)."
     ),
 ]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run, such as out/tile19.")]
+Panels = Annotated[
+    str,
+    typer.Option(
+        "--panels",
+        metavar="NAME,...",
+        help="Some of truth, sub-image, estimate, error, deviation, in this order (default: all that are known).",
+    ),
+]
+Crop = Annotated[
+    str,
+    typer.Option("--crop", metavar="ROW,COLUMN,ROWS,COLUMNS", help="Show this part of the target (default: all)."),
+]
+DarkGround = Annotated[bool, typer.Option("--dark", help="Draw on dark ground, for dark slides.")]
 
 
 def reconstruct(
@@ -98,7 +114,11 @@ def reconstruct(
 
     detail, others = output.detail(verbose, quiet), formats_of(formats)
     *stacks, model = files
-    asked = options.changes(sets), options.lens_names(lens), options.regions(region)
+    asked = (
+        options.changes(sets),
+        options.lens_names(lens),
+        tuple(options.region("--region", text) for text in region or ()),
+    )
     common = FrameOptions(model, *asked, others, force)
     if len(stacks) != 1:
         if scheduler:
@@ -220,6 +240,25 @@ def report(path: StackOrFolder, folder: ResultFolder = None, as_json: Json = Fal
     pages = [str(reported / "report.html") for reported in outcome.folders]
     index = {} if outcome.index is None else {"index": str(outcome.index)}
     output.print_json({"pages": pages, **index}) if as_json else output.print_lines([*pages, *index.values()])
+
+
+def figure(
+    run: Run,
+    file: Output,
+    panels: Panels = "",
+    crop: Crop = "",
+    dark: DarkGround = False,
+    resolution: FigureResolution = SLIDE,
+    as_json: Json = False,
+) -> None:
+    """Draw panels of a run for a slide or a paper: .pdf, .svg or .png."""
+    from ommatid.reconstruct.output.slide import write_slide
+
+    names = tuple(name.strip() for name in panels.split(",")) if panels else ()
+    part = options.region("--crop", crop) if crop else None
+    drawn = write_slide(run, file, names, part, dark, resolution)
+    output.say(f"{file}: written, {', '.join(drawn)}")
+    output.print_result({"file": str(file), "panels": list(drawn)}, [], as_json)
 
 
 def check(

@@ -57,8 +57,9 @@ def show(
     description = describe_scene(described)
     if figure is not None:
         from ommatid.figures.camera_drawing import write_drawing
+        from ommatid.figures.saving import figure_format
 
-        files = options.figure_files(figure_formats, figure_resolution, figure.suffix.lstrip(".").lower())
+        files = options.figure_files(figure_formats, figure_resolution, figure_format(figure))
         for path in write_drawing(figure, described, files, focus_curves(described)):
             output.say(f"{path}: written")
     output.print_result(description, scene_sections(description), as_json)

@@ -13,14 +13,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ommatid.runtime.errors import InputError
 from ommatid.runtime.printable import printable_label
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.geometry.optical_terms import LensTerms, OpticalTerms, ThroughFocus, optical_terms
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.scene import Scene
 
-from .saving import COLOURS, FORMATS, INK, SCREEN_PNG, FigureFiles, new_figure, own_style
+from .saving import COLOURS, INK, SCREEN_PNG, FigureFiles, new_figure, own_style
 from .sensor_drawing import ARROW, draw_sensor, draw_sub_images, length_words, sensor_aspect, write_beside
 
 WIDTH = 10.0  # inches, as are all lengths of the layout
@@ -72,13 +71,10 @@ def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True, curv
 def write_drawing(
     path: Path, scene: Scene, files: FigureFiles = SCREEN_PNG, curves: Sequence[ThroughFocus] = ()
 ) -> list[Path]:
-    """Write the drawing of a scene's camera, and return its files. Raises InputError or MachineError.
+    """Write the drawing of a scene's camera, and return its files. Raises MachineError.
 
     curves : as of `camera_drawing`
     """
-    for name in files.formats:
-        if name not in FORMATS:
-            raise InputError(f"--figure {path}: expected a file that ends in .{', .'.join(FORMATS)}, got '{path.name}'")
     files.save(camera_drawing(scene, derive(scene), curves=curves), path)
     return files.paths(path)
 

@@ -62,6 +62,14 @@ def figure_formats(text: str) -> tuple[str, ...]:
     return names
 
 
+def figure_format(path: Path) -> str:
+    """Return the format that the suffix of a figure's file names. Raises InputError for another one."""
+    name = path.suffix.lstrip(".").lower()
+    if name not in FORMATS:
+        raise InputError(f"{path}: expected a file that ends in .{', .'.join(FORMATS)}, got '{path.suffix}'")
+    return name
+
+
 @contextmanager
 def own_style() -> Generator[None]:
     """Draw with Matplotlib's defaults, whatever a matplotlibrc or a notebook has set. Also usable as a decorator.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from ommatid.reconstruct.output.overview import OVERVIEW, grid, write_overview
 from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.scenes import stack as stack_file
-from ommatid.scenes.formats import exr
 
 from ..kept_figures import KeptFigures
 
@@ -31,15 +29,6 @@ def drawn(folder: Path) -> Any:
     channels = read_estimate(folder / ESTIMATE).channels
     write_overview(folder, stack_file.read(folder / "stack.exr"), channels, run_json.read(folder), figures)
     return figures.kept[Path(OVERVIEW).stem]
-
-
-@pytest.fixture(scope="module")
-def without_truth(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = shutil.copytree(finished, tmp_path_factory.mktemp("overview") / "run")
-    [part] = exr.read(folder / "estimate.exr")
-    maps = {name: part.channels[name] for name in ("estimate", "variance")}
-    exr.write(folder / "estimate.exr", [exr.Part("estimate", maps, part.record)])
-    return folder
 
 
 @pytest.mark.parametrize("known", [True, False])

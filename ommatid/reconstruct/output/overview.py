@@ -7,14 +7,14 @@ error stand above them. All is in the files of a run, so that the figure can be 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from ommatid.figures.panels import FigurePanel, FigureScale, draw_panel
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
-from ommatid.runtime.arrays import Float32Array, FloatArray
+from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.printable import printable_label
 from ommatid.scenes.stack import Stack
 
@@ -26,18 +26,8 @@ OVERVIEW = "overview.png"
 COLUMN_INCHES, ROW_INCHES = 3.4, 3.15
 LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.55, 1.25, 0.55  # inches around all panels; a layout by matplotlib takes a second
 MOST_IN_A_ROW = 6
-MOST_SHOWN = 480  # rows and columns of a map that a panel can show
 LEAST_PART = 1e-4  # of the expected error; smaller parts are not drawn
 GOOD, DOUBT, BAD = "#17734a", "#8a5a00", "#b3261e"  # of the verdict
-
-
-@dataclass(frozen=True)
-class OverviewPanel:
-    """A map of the overview, and the colour scale that suits its content."""
-
-    title: str
-    image: FloatArray
-    content: Literal["values", "recorded", "error", "deviation"]
 
 
 @own_style()
@@ -45,8 +35,9 @@ def write_overview(
     folder: Path, stack: Stack, channels: Mapping[str, Float32Array], report: RunReport, files: FigureFiles = SCREEN_PNG
 ) -> None:
     """Draw a result; channels : of its estimate.exr. Raises InputError or MachineError."""
-    maps = {name: channel.astype(np.float64) for name, channel in channels.items()}
-    panels, grey = _panels(stack, maps), _grey_range(maps.get("truth", maps["estimate"]))
+    maps = result_panels(channels)
+    sub_images = _sub_images(stack, maps["estimate"].scale)
+    panels = [maps.pop("truth"), *sub_images, *maps.values()] if "truth" in maps else [*sub_images, *maps.values()]
     rows, across = grid(len(panels) + 1)
     width, height = COLUMN_INCHES * across, ROW_INCHES * rows + TOP - 0.35
     figure = new_figure(width, height)
@@ -54,7 +45,7 @@ def write_overview(
     figure.subplots_adjust(**edges, wspace=0.5, hspace=0.45)
     _write_headline(figure, stack.scene.title, report)
     for index, panel in enumerate(panels):
-        _draw_panel(figure, figure.add_subplot(rows, across, 1 + index), panel, grey)
+        draw_panel(figure.add_subplot(rows, across, 1 + index), panel)
     _draw_budget(figure.add_subplot(rows, across, (len(panels) + 1, rows * across)), report)
     files.replace(figure, folder / OVERVIEW)
 
@@ -75,15 +66,18 @@ def _write_headline(figure: Any, title: str, report: RunReport) -> None:
     figure.text(0.5, 1 - 0.58 / height, words, ha="center", fontweight="bold", **style)
 
 
-def _panels(stack: Stack, maps: dict[str, FloatArray]) -> list[OverviewPanel]:
-    """Return the maps in their order: what is given, then what is computed."""
-    estimate, truth = maps["estimate"], maps.get("truth")
-    panels = [] if truth is None else [OverviewPanel("Truth", truth, "values")]
-    panels += [*_sub_images(stack), OverviewPanel("Estimate", estimate, "values")]
+def result_panels(channels: Mapping[str, Float32Array]) -> dict[str, FigurePanel]:
+    """Return the panels of truth, estimate, error and deviation; without the truth those of estimate and deviation."""
+    maps = {name: channel.astype(np.float64) for name, channel in channels.items()}
+    estimate, truth, deviation = maps["estimate"], maps.get("truth"), np.sqrt(maps["variance"])
+    grey = FigureScale.grey(estimate if truth is None else truth)
+    panels = {} if truth is None else {"truth": FigurePanel("Truth", truth, grey)}
+    panels["estimate"] = FigurePanel("Estimate", estimate, grey)
     if truth is not None:
-        panels.append(OverviewPanel("Error: estimate minus truth", estimate - truth, "error"))
-    deviation = np.sqrt(maps["variance"])
-    return [*panels, OverviewPanel("Expected standard deviation", deviation, "deviation")]
+        error = estimate - truth
+        panels["error"] = FigurePanel("Error: estimate minus truth", error, FigureScale.signed(error))
+    scale = FigureScale.positive(float(deviation.max()), "standard deviation (grey levels)")
+    return {**panels, "deviation": FigurePanel("Expected standard deviation", deviation, scale)}
 
 
 def _draw_budget(axes: Any, report: RunReport) -> None:
@@ -105,14 +99,9 @@ def _draw_budget(axes: Any, report: RunReport) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _grey_range(image: FloatArray) -> tuple[float, float]:
-    low, high = float(image.min()), float(image.max())
-    return (low, high) if high > low else (low - 0.5, high + 0.5)
-
-
-def _sub_images(stack: Stack) -> list[OverviewPanel]:
+def _sub_images(stack: Stack, grey: FigureScale) -> list[FigurePanel]:
     """Return the middle sub-image of each lens type."""
-    panels: list[OverviewPanel] = []
+    panels: list[FigurePanel] = []
     subs = list(zip(stack.camera.sub_imagers, stack.images(), strict=True))
     for lens_type in stack.camera.types:
         members = [(sub, image) for sub, image in subs if sub.type == lens_type]
@@ -120,35 +109,6 @@ def _sub_images(stack: Stack) -> list[OverviewPanel]:
         rows, columns = lens_type.array
         name = f"Type {lens_type.name}, sub-image {sub.k}, {sub.l} of {rows} x {columns}"
         masked = "" if lens_type.is_open else f", pixels open by {lens_type.opening}"
-        panels.append(OverviewPanel(f"{name}\nmagnification {1 / lens_type.ratio}{masked}", image, "recorded"))
+        title = f"{name}\nmagnification {1 / lens_type.ratio}{masked}"
+        panels.append(FigurePanel(title, image, grey, "sensor pixels"))
     return panels
-
-
-def _draw_panel(figure: Any, axes: Any, panel: OverviewPanel, grey: tuple[float, float]) -> None:
-    low, high, colours, label = *grey, "gray", "grey level (0 to 255)"
-    if panel.content == "error":
-        high = float(np.abs(panel.image).max()) or 1.0
-        low, colours, label = -high, "RdBu_r", "error (grey levels)"
-    elif panel.content == "deviation":
-        low, high, colours = 0.0, float(panel.image.max()) or 1.0, "viridis"
-        label = "standard deviation (grey levels)"
-    rows, columns = panel.image.shape
-    each = max(1, max(rows, columns) // MOST_SHOWN)
-    drawn = axes.imshow(
-        panel.image[::each, ::each],
-        cmap=colours,
-        vmin=low,
-        vmax=high,
-        interpolation="nearest",
-        extent=(-0.5, columns - 0.5, rows - 0.5, -0.5),
-    )
-    axes.set_title(panel.title, fontsize=10)
-    unit = "sensor pixels" if panel.content == "recorded" else "target pixels"
-    axes.set_xlabel(f"column ({unit})", fontsize=8)
-    axes.set_ylabel(f"row ({unit})", fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.yaxis.get_major_locator().set_params(integer=True)
-    bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
-    bar.set_label(label, fontsize=8)
-    bar.ax.tick_params(labelsize=8)

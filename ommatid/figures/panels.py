@@ -1,0 +1,84 @@
+"""Panels of figures: maps, upright and with square pixels, each with the colour scale that suits its content.
+
+Maps are (rows, columns). Their scales are common where they are equal: a bar then serves several panels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ommatid.runtime.arrays import FloatArray
+
+MOST_SHOWN = 480  # rows and columns of a map that a panel of a screen can show
+
+
+@dataclass(frozen=True)
+class FigureScale:
+    """The values at the ends of a colour scale, Matplotlib's name of its colours, and the quantity with its unit."""
+
+    low: float
+    high: float
+    colours: str
+    label: str
+
+    @classmethod
+    def grey(cls, image: FloatArray) -> FigureScale:
+        """Return the grey scale from the smallest to the largest value of an image."""
+        low, high = float(np.nanmin(image)), float(np.nanmax(image))
+        return cls(*((low, high) if high > low else (low - 0.5, high + 0.5)), "gray", "grey level (0 to 255)")
+
+    @classmethod
+    def signed(cls, error: FloatArray) -> FigureScale:
+        """Return a scale with zero in its middle."""
+        high = float(np.nanmax(np.abs(error))) or 1.0
+        return cls(-high, high, "RdBu_r", "error (grey levels)")
+
+    @classmethod
+    def positive(cls, high: float, label: str) -> FigureScale:
+        """Return a scale from zero."""
+        return cls(0.0, high or 1.0, "viridis", label)
+
+
+@dataclass(frozen=True)
+class FigurePanel:
+    """A map of a figure.
+
+    place : row and column of its first pixel, and the side of its pixels, all in `unit`
+    """
+
+    title: str
+    image: FloatArray
+    scale: FigureScale
+    unit: str = "target pixels"
+    place: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+
+def show_map(axes: Any, panel: FigurePanel, most: int = MOST_SHOWN) -> Any:
+    """Draw the pixels of a panel, and return Matplotlib's image; of larger maps than `most` every n-th pixel."""
+    (rows, columns), (row, column, side) = panel.image.shape, panel.place
+    each = max(1, max(rows, columns) // most)
+    return axes.imshow(
+        panel.image[::each, ::each],
+        cmap=panel.scale.colours,
+        vmin=panel.scale.low,
+        vmax=panel.scale.high,
+        interpolation="nearest",
+        extent=(column - 0.5, column - 0.5 + columns * side, row - 0.5 + rows * side, row - 0.5),
+    )
+
+
+def draw_panel(axes: Any, panel: FigurePanel) -> None:
+    """Draw a panel with its title, with the numbers of rows and columns, and with a bar beside it."""
+    drawn = show_map(axes, panel)
+    axes.set_title(panel.title, fontsize=10)
+    axes.set_xlabel(f"column ({panel.unit})", fontsize=8)
+    axes.set_ylabel(f"row ({panel.unit})", fontsize=8)
+    axes.tick_params(labelsize=8)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.get_major_locator().set_params(integer=True)
+    bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
+    bar.set_label(panel.scale.label, fontsize=8)
+    bar.ax.tick_params(labelsize=8)

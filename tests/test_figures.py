@@ -44,7 +44,6 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/equations.md", "The common level"): "numbers of equations in a book",
     ("docs/frames.md", "Time and memory"): "times and memory, `python -m tests.benchmarks frames`",
     ("docs/frames.md", "Worlds finer than f"): "experiments against exact solutions, which no command prints",
-    ("docs/frames.md", "Other arrays, and misaligned cameras"): "experiments against exact solutions",
     ("docs/frames.md", "Whole frames"): "defaults and limits of the program",
     ("docs/frames.md", "Error bars"): "experiments against exact solutions, which no command prints",
     ("docs/frames.md", "Tiles"): "experiments against exact solutions, which no command prints",

@@ -39,7 +39,6 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/install.md", "Install"): "the version of Python",
     ("docs/install.md", "The fast backend"): "measured once on a machine with a graphics card",
     ("docs/speed.md", None): "times and ratios of `make bench`",
-    ("docs/batches.md", "Many frames of one camera"): "ratios of times, measured once",
     ("docs/equations.md", "The noise"): "constants of the text",
     ("docs/equations.md", "The common level"): "numbers of equations in a book",
     ("docs/frames.md", "Time and memory"): "times and memory, `python -m tests.benchmarks frames`",

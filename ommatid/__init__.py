@@ -3,7 +3,7 @@
 The functions of this module do what the commands of the same names do, and return arrays:
 
     import ommatid
-    scene = ommatid.read_scene("tile19", set=["noise.variance=1e-2"])
+    scene = ommatid.read_scene("tile19", set={"noise.variance": 1e-2})
     stack, model = ommatid.render(scene), ommatid.calibrate(scene)
     result = ommatid.reconstruct(stack, model)
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Stack,
         calibrate,
         check,
+        observe,
         predict,
         prepare,
         read_model,
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
         reconstruct,
         render,
         run,
+        stack,
         target_image,
     )
 
@@ -50,6 +52,7 @@ __all__ = [
     "Stack",
     "calibrate",
     "check",
+    "observe",
     "predict",
     "prepare",
     "read_model",
@@ -59,6 +62,7 @@ __all__ = [
     "reconstruct",
     "render",
     "run",
+    "stack",
     "target_image",
 ]
 
@@ -81,4 +85,4 @@ def __getattr__(name: str) -> "Any":
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

@@ -7,20 +7,21 @@ refuses raises MachineError; both say in one sentence what was expected, what ca
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ommatid.batch.remote import SILENT
 from ommatid.pipeline import stages
-from ommatid.reconstruct.output import result_files
 from ommatid.reconstruct.output.run_json import HeldOutReport
 from ommatid.reconstruct.prediction import Prediction
+from ommatid.reconstruct.restore import check_camera
 from ommatid.result import Reconstructor
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import FloatArray, as_numbers
 from ommatid.runtime.errors import InputError, MachineError, naming_source
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import no_progress
@@ -31,24 +32,30 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.scene import TRUTH, Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.scenes.tables.toml import changes_of
 
 from . import notebook
-from .result import Result, check_type, flat_truth, result_of
+from .result import Result, check_type
 
 __all__ = ["InputError", "MachineError", "Model", "Reconstructor", "Result", "Scene", "Stack"]
 
 
 def read_scene(
-    path: str | Path, set: str | Sequence[str] = (), lens: str | Sequence[str] = (), allow_outside: bool = False
+    path: str | Path,
+    set: Mapping[str, object] | str | Sequence[str] = (),
+    lens: str | Sequence[str] = (),
+    allow_outside: bool = False,
 ) -> Scene:
     """Read a scene file, or a scene of the gallery by its name.
 
-    set : changes of keys, such as "noise.variance=1e-2";  lens : names of the lens types to keep, absent: all
+    set : keys with their values, {"noise.variance": 1e-2}, None to remove a key; or as texts, ["noise.variance=1e-2"]
+    lens : names of the lens types to keep, absent: all
     allow_outside : True if the files of its world may be outside the folder of the world's file
     Raises InputError that names the file and the key.
     """
     names = lens.split(",") if isinstance(lens, str) and lens else lens
-    changes = [*([set] if isinstance(set, str) else set), *([scene_file.ALLOW_OUTSIDE] if allow_outside else ())]
+    given = changes_of(set) if isinstance(set, Mapping) else [set] if isinstance(set, str) else set
+    changes = [*given, *([scene_file.ALLOW_OUTSIDE] if allow_outside else ())]
     return scene_file.read(Path(path), changes, [name.strip() for name in names])
 
 
@@ -72,7 +79,7 @@ def read_result(folder: str | Path) -> Result:
     run = read_run(Path(folder))
     truth = None if run.truth is None else run.truth.astype(np.float64)
     deviation = np.sqrt(run.variance.astype(np.float64))
-    return Result(run.stack, run.model, run.estimate.astype(np.float64), deviation, truth, run.report)
+    return Result(run.stack, run.model, run.estimate.astype(np.float64), deviation, truth, stored=run.report)
 
 
 def target_image(scene: Scene | str | Path) -> FloatArray:
@@ -117,6 +124,34 @@ def render(scene: Scene | str | Path) -> Stack:
     return replace(stack, scene=setup.resolved)  # which names the scene file, not the temporary one
 
 
+def stack(scene: Scene | str | Path, arrays: Mapping[str, ArrayLike]) -> Stack:
+    """Make a stack of sub-images that are arrays already, in units of f and upright.
+
+    arrays : by lens type, (rows, columns of the lens array, rows, columns of a sub-image) each, as `Stack.arrays`
+        returns them; NaN marks dead pixels
+    Raises InputError for a scene with a [sensor], and for missing arrays, other names, shapes or infinite values.
+    """
+    return stack_file.stack_from_arrays(_scene(scene), arrays)
+
+
+def observe(model: Model, images: ArrayLike, seed: int, scene: Scene | str | Path | None = None) -> Stack | list[Stack]:
+    """Record given images without rendering: H f with the sensor's noise, bits and saturation.
+
+    images : (rows, columns) for one stack, (..., rows, columns) for a list of stacks in the order of the leading axes;
+        on the grid of H, in units of f
+    seed : of the noise; each of several images has streams of its own, which follow from the seed and its number
+    scene : whose [noise] or [sensor] records, and whose [prior] and [estimator] apply later; None: that of the model
+    Raises InputError for other shapes, for values that are not finite, and if scene and model are of different cameras.
+    """
+    from ommatid.simulate.observe import observed_stacks
+
+    check_type("model", model, Model, "read_model")
+    setup = Setup.from_scene(model.scene if scene is None else _scene(scene))
+    check_camera(setup.camera, model, (setup.scene.source, "the model"))
+    stacks = observed_stacks(setup, model, as_numbers(images, "images"), seed)
+    return stacks[0] if np.ndim(images) == 2 else stacks
+
+
 def calibrate(scene: Scene | str | Path, stack: Stack | None = None) -> Model:
     """Find H of a scene, (M, N), with the variance of its every entry.
 
@@ -149,11 +184,7 @@ def reconstruct(stack: Stack, model: Model, truth: FloatArray | None = None) -> 
     """
     check_type("stack", stack, Stack, "read_stack")
     check_type("model", model, Model, "read_model")
-    flat = None if truth is None else flat_truth(truth, stack.camera)
-    names = Path("the stack"), Path("the model")
-    outcome, report = result_files.reconstruct(stack, model, flat, names)
-    report = report.with_changes(fingerprint=result_files.fingerprint_of(stack, model, flat))
-    return result_of(stack, model, outcome, report)
+    return Reconstructor(model)(stack, truth)
 
 
 def prepare(model: Model, scene: Scene | str | Path | None = None) -> Reconstructor:
@@ -176,7 +207,6 @@ def check(stack: Stack, model: Model, *, fitted: bool = True) -> HeldOutReport:
     Raises InputError if stack and model are of different cameras, or if a measurement has no noise.
     """
     from ommatid.reconstruct.held_out.check import check_held_out
-    from ommatid.reconstruct.restore import check_camera
 
     check_type("stack", stack, Stack, "read_stack")
     check_type("model", model, Model, "read_model")

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ommatid.reconstruct.methods.method import Prepared
-from ommatid.reconstruct.output import result_files
+from ommatid.reconstruct.output.report import report_of
+from ommatid.reconstruct.output.result_files import ESTIMATOR_TABLES, fingerprint_of
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.restore import Reconstruction, check_camera
-from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.errors import InputError, shortened_repr
-from ommatid.runtime.files import digest, fingerprint
+from ommatid.reconstruct.restore import Reconstruction, check_camera, restore
+from ommatid.runtime.arrays import FloatArray, as_numbers
+from ommatid.runtime.errors import InputError, shortened, shortened_repr
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
@@ -32,8 +32,8 @@ class Result:
     """A reconstructed image with its posterior standard deviation.
 
     image, deviation : (rows, columns);  truth : (rows, columns), None where it is not known
-    summary : the content of run.json
     reconstruction : the estimator's own record, with its budget of errors and `region`; None for a run read from files
+    stored : run.json of a run read from files
     """
 
     stack: Stack
@@ -41,18 +41,39 @@ class Result:
     image: FloatArray
     deviation: FloatArray
     truth: FloatArray | None
-    summary: RunReport
     reconstruction: Reconstruction | None = None
+    stored: RunReport | None = None
+
+    def __repr__(self) -> str:
+        """Return title, size and errors in one line."""
+        rows, columns = self.image.shape
+        error = f"expected error {self.expected_mse**0.5:.3g} rms"
+        measured = "" if self.mse is None else f", measured {self.mse**0.5:.3g}"
+        return f"<Result '{shortened(self.stack.scene.title)}': {rows} x {columns} pixels, {error}{measured}>"
+
+    @cached_property
+    def summary(self) -> RunReport:
+        """The content of run.json, with the checks of the verdict, made when it is first used."""
+        if self.stored is not None:
+            return self.stored
+        if self.reconstruction is None:
+            raise TypeError("expected a reconstruction, or the report of a run")
+        report = report_of(self.stack, self.model, self.reconstruction)
+        return report.with_changes(fingerprint=fingerprint_of(self.stack, self.model, self.truth))
 
     @property
     def expected_mse(self) -> float:
         """Expected mean squared error per pixel (Wood et al. 2005, Eq. 5), in squared units of the target."""
-        return self.summary.error.predicted_mse
+        made = self.reconstruction
+        return self.summary.error.predicted_mse if made is None else made.expected.mse
 
     @property
     def mse(self) -> float | None:
         """Measured mean squared error per pixel, None without the truth."""
-        return self.summary.error.mse
+        made = self.reconstruction
+        if made is None:
+            return self.summary.error.mse
+        return None if made.error is None else made.error.mse
 
     @property
     def trusted(self) -> bool | None:
@@ -109,11 +130,10 @@ class Result:
         return notebook.result_html(self.stack.scene.title, self.image, self.deviation, self.truth, self.summary)
 
 
-def result_of(stack: Stack, model: Model, outcome: Reconstruction, report: RunReport) -> Result:
-    """Return the result of a reconstruction; report : the content of its run.json."""
+def _result_of(stack: Stack, model: Model, outcome: Reconstruction) -> Result:
     image, deviation = outcome.estimate.reshape(outcome.shape), np.sqrt(outcome.expected.variance)
     truth = None if outcome.truth is None else outcome.truth.reshape(outcome.shape)
-    return Result(stack, model, image, deviation.reshape(outcome.shape), truth, report, outcome)
+    return Result(stack, model, image, deviation.reshape(outcome.shape), truth, outcome)
 
 
 def check_type(name: str, value: object, expected: type, reader: str) -> None:
@@ -126,11 +146,7 @@ def check_type(name: str, value: object, expected: type, reader: str) -> None:
 
 def flat_truth(truth: FloatArray, camera: Camera) -> FloatArray:
     """Return the truth flattened. Raises InputError for another shape, and for values that are not finite numbers."""
-    world = camera.world
-    try:
-        image = np.asarray(truth, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"truth: expected an array of numbers, got {shortened_repr(truth)}") from error
+    world, image = camera.world, as_numbers(truth, "truth")
     if image.shape not in (camera.shape, (camera.unknowns,), world.shape, (world.unknowns,)):
         raise InputError(f"truth: expected {camera.rows} x {camera.columns} pixels, got an array of {image.shape}")
     if not np.isfinite(image).all():
@@ -153,7 +169,10 @@ class Reconstructor:
             check_camera(derive(scene), model, (scene.source, NAMES[1]))
         self._model, self._scene = model, scene
         self._prepared = Prepared(model)
-        self._model_digest: str | None = None
+
+    def __repr__(self) -> str:
+        """Return the size of H in one line."""
+        return f"<Reconstructor of {self._model!r}>"
 
     def __call__(self, stack: Stack, truth: FloatArray | None = None) -> Result:
         """Reconstruct a stack, as `ommatid.reconstruct` does.
@@ -167,20 +186,11 @@ class Reconstructor:
         check_type("stack", stack, Stack, "read_stack")
         stack = self._with_estimator(stack)
         flat = None if truth is None else flat_truth(truth, stack.camera)
-        outcome, report = result_files.reconstruct(stack, self._model, flat, NAMES, prepared=self._prepared)
-        report = report.with_changes(fingerprint=self._fingerprint(stack))
-        return result_of(stack, self._model, outcome, report)
+        check_camera(stack.camera, self._model, NAMES)
+        return _result_of(stack, self._model, restore(stack, self._model, flat, prepared=self._prepared))
 
     def _with_estimator(self, stack: Stack) -> Stack:
         if self._scene is None:
             return stack
-        changes = {table: getattr(self._scene, table) for table in result_files.ESTIMATOR_TABLES}
+        changes = {table: getattr(self._scene, table) for table in ESTIMATOR_TABLES}
         return replace(stack, scene=stack.scene.model_copy(update=changes))
-
-    def _fingerprint(self, stack: Stack) -> str:
-        """Return the fingerprint of everything that an estimate depends on; H is read for the first stack only."""
-        if self._model_digest is None:
-            nothing = replace(stack, values=stack.values[:0], variance=stack.variance[:0], record={})
-            self._model_digest = result_files.fingerprint_of(nothing, self._model, None)
-        pixels = digest(stack.values, stack.variance)
-        return fingerprint([self._model_digest, pixels, stack.record, stack.scene.plain()])

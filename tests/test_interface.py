@@ -9,17 +9,21 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.sparse.linalg import lsqr
 
 import ommatid
 from ommatid.reconstruct.output.result_files import write_estimate
+from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.formats import exr
+from ommatid.scenes.tables.sensor import NoiseTable
 
 from .conftest import Command
 
@@ -78,7 +82,7 @@ def test_it_loads_mitsuba_only_to_render(tmp_path: Path) -> None:
 
 
 def test_its_names_are_there() -> None:
-    assert set(ommatid.__all__) <= set(dir(ommatid))
+    assert dir(ommatid) == sorted(ommatid.__all__)
     assert all(getattr(ommatid, name).__doc__ for name in ommatid.__all__)
     with pytest.raises(AttributeError, match="no attribute 'renderer'"):
         getattr(ommatid, "renderer")  # noqa: B009
@@ -91,6 +95,15 @@ def test_reconstruct_is_a_function_and_stays_a_package() -> None:
 
     assert callable(ommatid.reconstruct)
     assert getattr(ommatid.reconstruct, "restore") is restore  # noqa: B009
+
+
+def test_scenes_are_changed_by_texts_and_by_values() -> None:
+    texts = ["noise.variance=0.01", "noise.bits=8", "camera.lens.II.pixels=[2,2]", "title=dots 1/2", "prior.level="]
+    values = {"noise.variance": np.float64(0.01), "noise.bits": np.int64(8), "camera.lens.II.pixels": np.array([2, 2])}
+    values |= {"title": "dots 1/2", "prior.level": None}
+    assert ommatid.read_scene("tile19", set=values).plain() == ommatid.read_scene("tile19", set=texts).plain()
+    third = ommatid.read_scene("tile19", set={"camera.lens.I.magnification": Fraction(1, 3), "noise": {"bits": 8}})
+    assert (third.camera.lens[0].magnification, third.noise) == (Fraction(1, 3), NoiseTable(bits=8))
 
 
 # --- what it yields
@@ -192,6 +205,111 @@ def test_samples_are_chosen_for_the_stack_where_there_is_one() -> None:
     assert records[0] != records[1]
 
 
+# --- arrays in place of files
+
+
+def observed(model: ommatid.Model, image: ArrayLike, seed: int, changes: dict[str, object]) -> ommatid.Stack:
+    """The stack of one image, by the sensor of tile19 with changes."""
+    stack = ommatid.observe(model, image, seed, ommatid.read_scene("tile19", set={"noise": {}, **changes}))
+    assert isinstance(stack, ommatid.Stack)
+    return stack
+
+
+@pytest.fixture(scope="module")
+def ideal() -> ommatid.Model:
+    return ommatid.calibrate(ommatid.read_scene("tile19", set={"calibration.method": "ideal"}))
+
+
+@pytest.fixture(scope="module")
+def physical() -> ommatid.Model:
+    changes = {"calibration.method": "ideal", "sensor.prnu": 0.0, "sensor.dsnu": 0.0}
+    return ommatid.calibrate(ommatid.read_scene("sensor", set=changes, lens="I"))
+
+
+@pytest.fixture(scope="module")
+def ramp() -> FloatArray:
+    return np.linspace(20, 180, 361).reshape(19, 19)
+
+
+def test_sub_images_become_the_stack_that_they_are_of(ideal: ommatid.Model) -> None:
+    """Every value names its place: the lens type, the lens and the pixel, as the camera lists its measurements."""
+    camera = ideal.camera
+    arrays = {lens.name: np.arange(lens.measurements).reshape(*lens.array, *lens.pixels) for lens in camera.types}
+    stack = ommatid.stack("tile19", {name: arrays[name].tolist() for name in reversed(arrays)})
+    for sub, image in zip(camera.sub_imagers, stack.images(), strict=True):
+        np.testing.assert_array_equal(image, arrays[sub.type.name][sub.k, sub.l])
+    for name, array in stack.arrays().items():
+        np.testing.assert_array_equal(array, arrays[name])
+
+
+def test_a_given_stack_is_reconstructed_with_its_dead_pixels(ideal: ommatid.Model, ramp: FloatArray) -> None:
+    arrays = observed(ideal, ramp, 0, {"noise.variance": 1.0}).arrays()
+    arrays["II"][0, 1, 2, 2] = np.nan
+    result = ommatid.reconstruct(ommatid.stack(ommatid.read_scene("tile19", set="noise.variance=1"), arrays), ideal)
+    assert result.summary.diagnostics.pixels_dead == 1
+    assert float(np.mean((result.image - ramp) ** 2)) < 2 * result.expected_mse
+
+
+def test_the_noise_of_given_images_is_that_of_the_scene(ideal: ommatid.Model, ramp: FloatArray) -> None:
+    """Variance by chi-squared of M deviations to 5 standard errors; rounding to half a level, uniform; saturation."""
+    light, count = ideal.matrix @ ramp.ravel(), ideal.measurements
+    noisy = observed(ideal, ramp, 1, {"noise.variance": 4.0}).values - light
+    assert np.mean(noisy**2) == pytest.approx(4, abs=5 * 4 * (2 / count) ** 0.5)
+    assert abs(np.mean(noisy)) < 5 * 2 / count**0.5
+    rounded = observed(ideal, ramp, 1, {"noise.bits": 8}).values
+    np.testing.assert_array_equal(rounded, np.rint(light))
+    clipped = observed(ideal, ramp, 1, {"noise.variance": 4.0, "noise.saturation": 150.1})
+    np.testing.assert_array_equal(clipped.values, np.minimum(light + noisy, 150.1))
+    saturated = ommatid.reconstruct(clipped, ideal).summary.diagnostics.pixels_saturated
+    assert saturated == np.sum(light + noisy >= 150.1) > 0
+    np.testing.assert_allclose(observed(ideal, ramp, 1, {}).values, light, rtol=1e-12)
+
+
+def test_a_sensor_counts_the_electrons_of_given_images(physical: ommatid.Model) -> None:
+    """Photon transfer (EMVA 1288): between two lights, variance grows by the gain times the growth of the mean, DN."""
+    moments, count = list[tuple[float, float]](), 20
+    for level in (50.0, 150.0):
+        stacks = ommatid.observe(physical, np.full((count, *physical.camera.shape), level), 2)
+        assert isinstance(stacks, list)
+        readings = np.array([stack.recording.digital for stack in stacks if stack.recording is not None])
+        moments.append((float(readings.mean()), float(readings.var(axis=0, ddof=1).mean())))
+    (dim, quiet), (bright, noisy) = moments
+    error = (2 / ((count - 1) * physical.measurements)) ** 0.5 * (quiet + noisy)  # standard errors of both, at most
+    assert physical.scene.sensor is not None
+    assert 3 * error < noisy - quiet == pytest.approx(physical.scene.sensor.gain * (bright - dim), abs=5 * error)
+
+
+def test_each_of_many_images_has_its_own_noise(ideal: ommatid.Model, ramp: FloatArray) -> None:
+    many = ommatid.observe(ideal, np.stack([ramp, ramp, 2 * ramp]), 3)
+    few, alone = ommatid.observe(ideal, [[ramp, ramp]], 3), ommatid.observe(ideal, ramp.tolist(), 3)
+    assert isinstance(many, list)
+    assert isinstance(few, list)
+    assert isinstance(alone, ommatid.Stack)
+    np.testing.assert_array_equal([stack.values for stack in few], [stack.values for stack in many[:2]])
+    np.testing.assert_array_equal(alone.values, many[0].values)
+    first, second = (stack.values - ideal.forward(ramp) for stack in many[:2])
+    assert abs(np.corrcoef(first, second)[0, 1]) < 5 / ideal.measurements**0.5
+    reconstructor = ommatid.prepare(ideal)
+    for stack in many:
+        np.testing.assert_array_equal(reconstructor(stack).image, ommatid.reconstruct(stack, ideal).image)
+
+
+@pytest.mark.slow
+def test_given_images_are_observed_as_they_are_rendered() -> None:
+    """Chi-squared of the differences of a rendered and an observed stack, and both errors in one interval."""
+    changes = {"render.samples": 4096, "noise.variance": 1.0, "calibration.method": "ideal"}
+    scene = ommatid.read_scene("tile19", set=changes)
+    model, truth, rendered = ommatid.calibrate(scene), ommatid.target_image(scene), ommatid.render(scene)
+    stack = ommatid.observe(model, truth, 4)
+    assert isinstance(stack, ommatid.Stack)
+    squares = (rendered.values - stack.values) ** 2 / (rendered.variance + 2 * 1.0)
+    assert np.sum(squares) == pytest.approx(squares.size, abs=5 * (2 * squares.size) ** 0.5)
+    by_rays, by_matrix = (ommatid.reconstruct(each, model, truth) for each in (rendered, stack))
+    given = by_rays.summary.error.expected_given_truth
+    assert given is not None
+    assert given.low < by_matrix.summary.error.mse < given.high  # type: ignore[operator]
+
+
 # --- H as an operator
 
 
@@ -247,6 +365,17 @@ def pictures(html: str) -> list[Any]:
     return [np.asarray(Image.open(io.BytesIO(base64.b64decode(data)))) for data in found]
 
 
+def test_everything_has_one_line(
+    scene: ommatid.Scene, stack: ommatid.Stack, model: ommatid.Model, result: ommatid.Result
+) -> None:
+    things: list[object] = [scene, stack, model, result, result.summary, result.reconstruction, model.camera]
+    things += [ommatid.prepare(model), ommatid.predict(scene, rays=False), ommatid.check(stack, model)]
+    for thing in things:
+        assert re.fullmatch(r"<[A-Z].{10,140}>", repr(thing)), repr(thing)
+        assert type(thing).__name__ in repr(thing) == str(thing)
+    assert "19 x 19 pixels" in repr(result)
+
+
 def test_everything_shows_itself(
     scene: ommatid.Scene, stack: ommatid.Stack, model: ommatid.Model, result: ommatid.Result
 ) -> None:
@@ -266,6 +395,10 @@ def test_what_is_wrong_is_said() -> None:
     wrong: list[tuple[Callable[[], object], str]] = [
         (lambda: ommatid.read_scene("tile9"), "did you mean 'tile19'"),
         (lambda: ommatid.read_scene("tile19", set=["noise.varience=1"]), "'noise.variance'"),
+        (lambda: ommatid.read_scene("tile19", set={"noise.varience": 1}), "'noise.variance'"),
+        (lambda: ommatid.read_scene("tile19", set={"noise.variance": object()}), "set: noise.variance: expected a num"),
+        (lambda: ommatid.read_scene("tile19", set={"noise.bits": 2**70}), "set: noise.bits: expected a number"),
+        (lambda: ommatid.read_scene("tile19", set={"noise.bits": [1 + 1j]}), "set: noise.bits: expected a number"),
         (lambda: ommatid.read_scene("tile19", lens=["X"]), "no lens type is called 'X'"),
         (lambda: ommatid.read_stack("none.exr"), "no such file"),
         (lambda: ommatid.read_model("none.npz"), "no such file"),
@@ -290,12 +423,40 @@ def test_what_does_not_belong_together_is_said(stack: ommatid.Stack) -> None:
         ommatid.reconstruct(stack, wrong)
 
 
+def test_arrays_that_fit_no_camera_are_said(ideal: ommatid.Model, physical: ommatid.Model, ramp: FloatArray) -> None:
+    good: dict[str, Any] = observed(ideal, ramp, 0, {}).arrays()
+    infinite, other = np.full((3, 3, 5, 5), np.inf), ommatid.read_scene("tile35")
+    dark, of_one = np.full(physical.camera.shape, -80.0), r"arrays\['I'\]: expected"
+    shape = r"images: expected \[..., 19, 19\], the grid of H, got"
+    no_mapping: Any = list(good.values())
+    no_seed: Any = 0.5
+    wrong: list[tuple[Callable[[], object], str]] = [
+        (lambda: ommatid.stack("tile19", {"I": good["I"]}), "the lens types 'I', 'II', 'III', got 'I'"),
+        (lambda: ommatid.stack("tile19", no_mapping), "a dictionary by lens type"),
+        (lambda: ommatid.stack("tile19", good | {"I": good["I"][0]}), rf"{of_one} \[3, 3, 5, 5\].* got \[3, 5, 5\]"),
+        (lambda: ommatid.stack("tile19", good | {"I": infinite}), rf"{of_one} numbers up to 1e\+24"),
+        (lambda: ommatid.stack("tile19", good | {"I": "a.png"}), f"{of_one} an array of real numbers"),
+        (lambda: ommatid.stack("sensor", good), r"a \[sensor\] needs dark and flat frames"),
+        (lambda: ommatid.observe(ideal, ramp[:-1], 0), rf"{shape} \[18, 19\]; set target.shape of the scene"),
+        (lambda: ommatid.observe(ideal, ramp[0], 0), rf"{shape} \[19\]"),
+        (lambda: ommatid.observe(ideal, np.full((19, 19), np.nan), 0), "images: expected finite values"),
+        (lambda: ommatid.observe(ideal, [[1.0], [1.0, 2.0]], 0), "images: expected an array of numbers"),
+        (lambda: ommatid.observe(ideal, ramp, -1), "seed: expected a whole number of 0 or more, got -1"),
+        (lambda: ommatid.observe(ideal, ramp, no_seed), "seed: expected a whole number"),
+        (lambda: ommatid.observe(ideal, ramp, 0, other), "do not belong together"),
+        (lambda: ommatid.observe(physical, dark, 0), "counts electrons.* got -80"),
+    ]
+    for call, words in wrong:
+        with pytest.raises(ommatid.InputError, match=words):
+            call()
+
+
 def test_a_truth_that_is_none_is_said(stack: ommatid.Stack, model: ommatid.Model) -> None:
     wrong: list[tuple[Any, str]] = [
         (np.zeros((3, 3)), "expected 19 x 19 pixels"),
         (np.zeros((1, 361)), "expected 19 x 19 pixels"),
         (np.full((19, 19), np.nan), "expected finite values"),
-        ("truth.exr", "expected an array of numbers"),
+        ("truth.exr", "expected an array of real numbers"),
     ]
     for truth, words in wrong:
         with pytest.raises(ommatid.InputError, match=f"truth: {words}"):

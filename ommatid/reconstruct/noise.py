@@ -83,7 +83,8 @@ def usable_pixels(stack: Stack, model: Model | None = None) -> UsablePixels:
     if stack.recording is not None:
         full = alive & stack.recording.saturated
     elif noise is not None and noise.saturation is not None:
-        full = alive & (stack.values >= np.float32(noise.saturation))  # the stack holds float32
+        # A stack that was stored holds float32.
+        full = alive & (stack.values >= min(noise.saturation, float(np.float32(noise.saturation))))
     return UsablePixels(alive & ~full, int(np.sum(~alive)), full)
 
 

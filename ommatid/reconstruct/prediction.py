@@ -63,6 +63,12 @@ class Prediction:
     as_designed: float | None = None
     calibrated: float | None = None
 
+    def __repr__(self) -> str:
+        """Return size, rank and error in one line."""
+        size = f"{self.measurements} measurements, {self.unknowns} unknowns"
+        rank = "" if self.rank is None else f", rank {self.rank}"
+        return f"<Prediction: {size}{rank}, expected error {self.mse**0.5:.3g} rms>"
+
     @classmethod
     def of(
         cls,

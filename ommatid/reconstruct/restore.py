@@ -189,6 +189,11 @@ class Reconstruction:
     task: EstimationTask
     verdict: VerdictReport
 
+    def __repr__(self) -> str:
+        """Return size, method and error in one line."""
+        error = f"expected error {self.expected.mse**0.5:.3g} rms"
+        return f"<Reconstruction: {self.shape[0]} x {self.shape[1]} pixels, {self.choice.method}, {error}>"
+
     @property
     def estimate(self) -> FloatArray:
         """f^, (N,)."""

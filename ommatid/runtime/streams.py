@@ -38,6 +38,7 @@ class Purpose(IntEnum):
     REPEAT = 10  # of a measurement: a scene with a seed of its own
     PAPER = 11  # noise on the tiles of a photograph
     FRACTIONS = 12  # of the photograph's pixels
+    OBSERVATION = 13  # of one of several given images: a scene with a seed of its own
     # of a sampler's seed
     BLOCK = 20  # of pixels whose rays start together
     DRAW = 21  # by a ray

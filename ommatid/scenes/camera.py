@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, named
 from ommatid.runtime.machine import check_memory
 
 from .constants import MOST_DENSE
@@ -59,6 +59,11 @@ class Camera:
     bands: tuple[tuple[float, float], ...] = ()
     walls: bool = True
     sensor_distance: float | None = None
+
+    def __repr__(self) -> str:
+        """Return target and lens types in one line."""
+        lenses = named(lens.name for lens in self.types)
+        return f"<Camera: target {self.rows} x {self.columns} pixels, lens types {lenses}>"
 
     @property
     def wavelengths(self) -> tuple[tuple[float, float], ...]:

@@ -16,7 +16,7 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator
 
 from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 
 from .camera import Camera
 from .constants import MOST_DENSE
@@ -49,6 +49,12 @@ class Model:
     batches: Float32Array
     record: dict[str, Any]
     fitted: FittedMatrix | None = field(default=None, kw_only=True)
+
+    def __repr__(self) -> str:
+        """Return size and method of H in one line."""
+        return (
+            f"<Model: H {self.measurements} x {self.unknowns}, {shortened(str(self.record.get('method', 'unknown')))}>"
+        )
 
     @property
     def matrix(self) -> sparse.csr_array:

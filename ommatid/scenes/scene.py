@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, named, shortened
 from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import read_text, real_path
 from ommatid.runtime.printable import printable
@@ -35,7 +35,7 @@ from .tables.gallery import find_scene, missing_scene
 from .tables.messages import explain
 from .tables.sensor import LightTable, NoiseTable, SensorTable
 from .tables.table import Table, allow_absent
-from .tables.toml import apply_overrides, keep_lenses
+from .tables.toml import Change, apply_overrides, keep_lenses
 from .tables.units import Corner, FileName, Length, Pair
 from .tables.world import WorldTable
 
@@ -142,6 +142,14 @@ class Scene(Table):
                         " got a pinhole"
                     )
         return self
+
+    def __repr__(self) -> str:
+        """Return title, target and lens types in one line."""
+        shape, lenses = self.target.shape, named(lens.name for lens in self.camera.lens)
+        grid = "whole picture" if shape is None else f"{shape[0]} x {shape[1]} pixels"
+        return f"<Scene '{shortened(self.title)}': {grid}, lens types {lenses}>"
+
+    __str__ = __repr__
 
     @property
     def source(self) -> Path:
@@ -268,7 +276,7 @@ def _with_source(scene: Scene, source: Path) -> Scene:
     return scene
 
 
-def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) -> Scene:
+def read(path: Path, overrides: Iterable[Change] = (), lenses: Iterable[str] = ()) -> Scene:
     """Read a scene file, apply `--set` overrides and keep only the named lens types, if any are named.
 
     `path` may be the name of a gallery scene. Relative paths of the target's picture and of the world start at the
@@ -291,7 +299,7 @@ def read(path: Path, overrides: Iterable[str] = (), lenses: Iterable[str] = ()) 
     return with_changes(data, path, overrides, lenses)
 
 
-def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[str], lenses: Iterable[str]) -> Scene:
+def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[Change], lenses: Iterable[str]) -> Scene:
     """The scene in `data` after `--set` overrides and `--lens`, with absolute paths. Raises InputError."""
     overrides = list(overrides)
     keys = [override for override in overrides if override != ALLOW_OUTSIDE]

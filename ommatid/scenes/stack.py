@@ -7,22 +7,25 @@ values follow.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.arrays import FloatArray, as_numbers
+from ommatid.runtime.errors import InputError, named, shortened, shortened_repr
+from ommatid.runtime.versions import versions
 
 from .camera import Camera, derive
 from .formats import exr
 from .formats.provenance import checked
-from .lens_type import adjacent_slices
+from .lens_type import LensType, adjacent_slices
 from .recording import Recording
-from .scene import Scene, parse_stored
+from .scene import Scene, parse_stored, resolved
 from .tables.table import LARGEST
 
 CHANNELS = ("Y", "variance")
@@ -48,10 +51,20 @@ class Stack:
     record: dict[str, Any]
     recording: Recording | None = None
 
+    def __repr__(self) -> str:
+        """Return title and size in one line."""
+        title, count = shortened(self.scene.title), len(self.camera.sub_imagers)
+        return f"<Stack '{title}': {count} sub-images, {self.values.size} measurements>"
+
     def images(self) -> list[FloatArray]:
         """The sub-images, (rows, columns) each, in the order of the camera's sub-imagers."""
         pairs = zip(self.camera.sub_imagers, self.camera.slices(), strict=True)
         return [self.values[pixels].reshape(sub.type.pixels) for sub, pixels in pairs]
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """The sub-images by lens type: (rows, columns of the lens array, rows, columns of a sub-image) each."""
+        pairs = zip(self.camera.types, self.camera.type_slices(), strict=True)
+        return {lens.name: self.values[pixels].reshape(*lens.array, *lens.pixels) for lens, pixels in pairs}
 
     def restrict(self, names: tuple[str, ...]) -> Stack:
         """The stack of only the named lens types, in its own order. Raises InputError for an unknown name."""
@@ -66,6 +79,43 @@ class Stack:
             variance=self.variance[mask],
             recording=None if self.recording is None else self.recording.restrict(mask),
         )
+
+
+def stack_from_arrays(scene: Scene, arrays: Mapping[str, ArrayLike]) -> Stack:
+    """The stack of given sub-images, by lens type as `Stack.arrays` returns them; NaN marks dead pixels.
+
+    Raises InputError for a scene with a [sensor], and for missing arrays, other names, shapes or infinite values.
+    """
+    if scene.sensor is not None:
+        raise InputError(
+            f"{scene.source}: a [sensor] needs dark and flat frames to convert its readings; convert them to values of"
+            " f and describe their noise by [noise], or import files with `ommatid import`"
+        )
+    camera = derive(scene)
+    if not isinstance(arrays, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise InputError(f"arrays: expected a dictionary by lens type, got {shortened_repr(arrays)}")
+    names = [lens.name for lens in camera.types]
+    if set(arrays) != set(names):
+        expected, got = named(names, "'"), named(arrays, "'")
+        raise InputError(f"arrays: expected one for each of the lens types {expected}, got {got}")
+    values = np.concatenate([_checked(arrays[lens.name], lens).ravel() for lens in camera.types])
+    record: dict[str, Any] = {"method": "imported", "seconds": 0.0, "versions": versions()}
+    return Stack(resolved(scene, camera.shape), camera, values, np.zeros(values.size), record)
+
+
+def _checked(given: ArrayLike, lens: LensType) -> FloatArray:
+    """The sub-images of a lens type as numbers. Raises InputError."""
+    array, expected = as_numbers(given, f"arrays['{lens.name}']"), (*lens.array, *lens.pixels)
+    if array.shape != expected:
+        raise InputError(
+            f"arrays['{lens.name}']: expected {list(expected)}, rows and columns of the lens array and of a sub-image,"
+            f" got {list(array.shape)}"
+        )
+    if not (np.isnan(array) | (np.abs(array) <= LARGEST**2)).all():
+        raise InputError(
+            f"arrays['{lens.name}']: expected numbers up to {LARGEST**2:g}, or NaN for dead pixels, got others"
+        )
+    return array
 
 
 def stack_from_recording(

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, computed_field, field_validator, model_validator
 
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, named, shortened
 from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import read_record
 from ommatid.scenes.formats.provenance import FitRecord
@@ -437,6 +437,13 @@ class HeldOutReport(Record):
     windows: HeldOutWindows
     sub_imagers: tuple[HeldOutEntry, ...]
 
+    def __repr__(self) -> str:
+        """Return the numbers of sub-imagers in one line."""
+        disagreeing = named(entry.name for entry in self.sub_imagers if entry.named)
+        return f"<HeldOutReport: {self.judged} sub-imagers predicted, disagreeing: {disagreeing}>"
+
+    __str__ = __repr__
+
     @property
     def judged(self) -> int:
         """Number of sub-imagers that were predicted."""
@@ -478,6 +485,13 @@ class RunReport(Record):
     regions: tuple[RegionReport, ...] = ()
     depth: tuple[DepthBin, ...] = ()
     study: tuple[StudyCase, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return title, size and error in one line."""
+        error = f"expected error {self.error.predicted_mse**0.5:.3g} rms"
+        return f"<RunReport '{shortened(self.title)}': {self.unknowns} pixels, {error}>"
+
+    __str__ = __repr__
 
     @field_validator("stages")
     @classmethod

@@ -8,12 +8,14 @@ from __future__ import annotations
 import copy
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast
 
-from ommatid.runtime.errors import InputError, named, shortened
+from ommatid.runtime.errors import InputError, named, shortened, shortened_repr
 
+Change = str | tuple[str, Any]  # KEY=VALUE, or a key and its value, None to remove the key
 DEEPEST = 16  # levels of nested tables; a scene has camera.lens[0].surfaces[0].radius
 LARGEST = 4_000_000  # bytes; parsing takes 30 times as much memory
 MOST_VALUES = 200_000
@@ -96,20 +98,16 @@ FILES = {  # first and last part of the keys that name files
 }
 
 
-def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+def apply_overrides(data: dict[str, Any], overrides: Iterable[Change]) -> dict[str, Any]:
     """A copy with keys set, such as `noise.variance=1e-6` or `camera.lens.II.pixels=[2,2]`; an empty value removes one.
 
     Values are read as by `value_of`; names of files are relative to the current folder. Raises InputError if a lens
     type of a key does not exist.
     """
     changed = copy.deepcopy(data)
-    for assignment in overrides:
-        key, equals, text = assignment.partition("=")
-        override = shortened(assignment)
-        if not equals or not key.strip():
-            raise InputError(f"--set {override}: expected KEY=VALUE, such as noise.variance=1e-6")
-        if any(0xD800 <= ord(character) < 0xE000 for character in assignment):
-            raise InputError(f"--set {override}: expected text in UTF-8, got other bytes")
+    for given in overrides:
+        key, value = _assignment(given) if isinstance(given, str) else given
+        override = shortened(given if isinstance(given, str) else f"{key}={value}")
         *tables, last = [part.strip() for part in key.split(".")]
         if len(tables) > DEEPEST:
             raise InputError(f"--set {override}: its key goes deeper than {DEEPEST} tables")
@@ -118,11 +116,51 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[str,
             table = _inside(table, name, override)
         if not isinstance(table, dict):
             raise InputError(f"--set {override}: '{'.'.join(tables)}' is not a table, so it has no key '{last}'")
-        if text.strip():
-            table[last] = _from_here([*tables, last], value_of(text))
-        else:
+        if value is None:
             table.pop(last, None)  # pyright: ignore[reportUnknownMemberType]
+        else:
+            table[last] = _from_here([*tables, last], value)
     return changed
+
+
+def _assignment(text: str) -> tuple[str, Any]:
+    """Return the key and the value, None without one, of KEY=VALUE. Raises InputError for another text."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise InputError(f"--set {shortened(text)}: expected KEY=VALUE, such as noise.variance=1e-6")
+    if any(0xD800 <= ord(character) < 0xE000 for character in text):
+        raise InputError(f"--set {shortened(text)}: expected text in UTF-8, got other bytes")
+    return key, value_of(value) if value.strip() else None
+
+
+def changes_of(values: Mapping[str, object]) -> list[Change]:
+    """Return the changes that set keys to values of Python, of NumPy included. Raises InputError for other objects."""
+    changes: list[Change] = []
+    for key, value in values.items():
+        try:
+            plain = None if value is None else _plain(value)
+            check({"value": plain})
+        except (TypeError, ValueError, RecursionError) as error:
+            raise InputError(
+                f"set: {shortened(str(key))}: expected a number, a text, a truth value, a list or a table, got"
+                f" {shortened_repr(value)}"
+            ) from error
+        changes.append((str(key), plain))
+    return changes
+
+
+def _plain(value: Any) -> Any:
+    """Return a value in TOML's types. Raises TypeError for one that has none."""
+    value = value.tolist() if hasattr(value, "tolist") else value  # of NumPy
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in cast(list[Any], value)]
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in cast(dict[Any, Any], value).items()}
+    if isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Path | Fraction):
+        return str(value)
+    raise TypeError(f"expected one of TOML's types, got {type(value)}")
 
 
 def _inside(table: Any, name: str, override: str) -> Any:

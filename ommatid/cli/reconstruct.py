@@ -175,27 +175,36 @@ def _reconstruct_many(
     frame failed or, if `strict`, if one is not to be trusted.
     """
     from ommatid.batch.frames import reconstruct_frames
+    from ommatid.page.batch_index import check_index
+    from ommatid.pipeline.reconstruction import finish_film
 
     if not stacks:
         raise InputError(f"{common.model}: expected stacks and then their model, got one file; name a stack before it")
+    check_index(folder)
     described: dict[Path, DescribedFrame] = {}
     with output.progress_bar("reconstruct") as progress:
         for frame, work in reconstruct_frames(stacks, folder, common, workers, progress):
             described[frame.stack] = _described(frame, work, strict, quiet=detail == "verdict")
-    _print_frames(folder, [described[stack] for stack in stacks], detail)
-    worst = max(frame.code for frame in described.values())
+    frames = [described[stack] for stack in stacks]
+    index, shown = finish_film(folder, [(each.frame, each.report, each.failure) for each in frames], common)
+    if detail != "verdict":
+        output.say(f"film: {shown}; {index}" if shown else f"{index}: written")
+    _print_frames(folder, frames, detail)
+    worst = max(frame.code for frame in frames)
     if worst:
         raise failures.BatchError(worst)
 
 
 @dataclass(frozen=True)
 class DescribedFrame:
-    """A frame's JSON object, its row, its exit code, and its report; None for one that failed."""
+    """A frame with its JSON object, its row, its exit code, and its report, or the reason of its failure."""
 
+    frame: Frame
     document: dict[str, Any]
     row: tuple[str, str]
     code: int
     report: RunReport | None
+    failure: str = ""
 
 
 def _print_frames(folder: Path, frames: Sequence[DescribedFrame], detail: output.Detail | None) -> None:
@@ -223,11 +232,11 @@ def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict:
     except Exception as error:
         code, reason = failures.report(error), printable_sentence(error)
         document = {**heading, "error": reason, "exit_code": code}
-        return DescribedFrame(document, (name, f"failed: {reason}"), code, None)
+        return DescribedFrame(frame, document, (name, f"failed: {reason}"), code, None, reason)
     if not quiet:
         output.say_done("reconstruct", made, frame.output)
     code = failures.NOT_TRUSTED if strict and not is_trusted(report) else 0
-    return DescribedFrame({**heading, **report.plain()}, frame_row(name, report), code, report)
+    return DescribedFrame(frame, {**heading, **report.plain()}, frame_row(name, report), code, report)
 
 
 def report(path: StackOrFolder, folder: ResultFolder = None, as_json: Json = False) -> None:

@@ -25,9 +25,9 @@ class FigureScale:
     label: str
 
     @classmethod
-    def grey(cls, image: FloatArray) -> FigureScale:
-        """Return the grey scale from the smallest to the largest value of an image."""
-        low, high = float(np.nanmin(image)), float(np.nanmax(image))
+    def grey(cls, image: FloatArray, aside: float = 0.0) -> FigureScale:
+        """Return the grey scale of the values of an image without `aside` per cent of them at either end."""
+        low, high = (float(end) for end in np.nanpercentile(image, (aside, 100 - aside)))
         return cls(*((low, high) if high > low else (low - 0.5, high + 0.5)), "gray", "grey level (0 to 255)")
 
     @classmethod

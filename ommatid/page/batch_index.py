@@ -6,7 +6,7 @@ A sweep is a batch with `sweep.json`, which lists its folders with the `values` 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
+from ommatid.batch.film import Film
 from ommatid.batch.sweep_row import NUMBERS, SweepRow, read_rows
 from ommatid.batch.sweep_table import PICTURE as SWEEP_PICTURE
 from ommatid.reconstruct.output import run_json
@@ -42,12 +43,15 @@ class BatchEntry:
     """Results of one scene of a batch, or the reason of its failure.
 
     sensor_area : of all recorded pixels, mm^2; None if it is not known
+    page, picture : addresses, relative to the index
     """
 
     name: str
     report: RunReport | None = None
     failure: str = ""
     sensor_area: float | None = None
+    page: str = ""
+    picture: str = ""
 
     @property
     def title(self) -> str:
@@ -74,10 +78,6 @@ class BatchEntry:
         """Run time of all stages."""
         return sum(stage.seconds for stage in self.report.stages.values()) if self.report else 0.0
 
-    def url(self, file: str) -> str:
-        """Return the address of a file of the run, relative to the index."""
-        return url(self.name, file)
-
 
 def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     """Write index.html of a batch unless it is up to date or there is no folder, and return True if it was written.
@@ -97,7 +97,22 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     drawn = SWEEP_PICTURE if picture.is_file() else ""
     stamp = fingerprint([described, [row.flat() for row in sweep], drawn, sources_digest()])
     name = real_path(output).name
-    return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, sweep, drawn, name, stamp), write_text)[1]
+    content = {"sweep": sweep, "sweep_picture": drawn, "title": f"Batch: {name}"}
+    return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, stamp, **content), write_text)[1]
+
+
+def write_film_index(output: Path, reports: Sequence[tuple[str, RunReport | None, str]], film: Film | None) -> Path:
+    """Write index.html of the frames of one camera, with their moving picture, and return its path.
+
+    reports : name of each frame, and its report or the reason of its failure
+    """
+    entries = [
+        BatchEntry(name, report, failure, page=quote(f"{name}.png"), picture=quote(f"{name}.png"))
+        for name, report, failure in reports
+    ]
+    content = {"film": film, "title": f"Film: {real_path(output).name}", "noun": "frames"}
+    write_text(output / INDEX, page(entries, fingerprint([name for name, *_ in reports]), **content))
+    return output / INDEX
 
 
 def check_index(output: Path) -> None:
@@ -114,7 +129,9 @@ def _entry(folder: Path, failure: str) -> BatchEntry:
         return BatchEntry(folder.name, failure=failure)
     try:
         check_folder(folder)
-        return BatchEntry(folder.name, run_json.read(folder), sensor_area=_sensor_area(folder / "scene.toml"))
+        report, area = run_json.read(folder), _sensor_area(folder / "scene.toml")
+        page, picture = (url(folder.name, file) for file in (REPORT, PICTURE))
+        return BatchEntry(folder.name, report, sensor_area=area, page=page, picture=picture)
     except InputError as error:
         return BatchEntry(folder.name, failure=str(error))
 
@@ -140,34 +157,25 @@ def read_sweep(path: Path) -> list[SweepRow]:
         return []
 
 
-def page(entries: list[BatchEntry], sweep: list[SweepRow], drawn: str, name: str, stamp: str) -> str:
+def page(
+    entries: list[BatchEntry], stamp: str, sweep: Sequence[SweepRow] = (), noun: str = "scenes", **content: Any
+) -> str:
     """Return the index as HTML; without figures if there is nothing to compare.
 
-    drawn : name of the file with the figure of the sweep, empty without one
+    noun : what the entries are;  content : its `title`; `sweep_picture`, file of the figure of the sweep; `film`
     """
     from .document import fill
 
-    content: dict[str, Any] = {
-        "entries": entries,
-        "sweep": sweep,
-        "sweep_keys": list(dict.fromkeys(key for row in sweep for key in row.values)),
-        "sweep_picture": drawn,
-        "url": url,
-        "title": f"Batch: {name}",
-        "words": words(entries),
-        "page_file": REPORT,
-        "picture_file": PICTURE,
-        "figure": _scenes_figure(entries),
-        "document": "",
-        "stamp": stamp,
-    }
-    return fill("index.html", content)
+    of_sweep = {"sweep": sweep, "sweep_keys": list(dict.fromkeys(key for row in sweep for key in row.values))}
+    of_batch = {"entries": entries, "words": words(entries, noun), "figure": _scenes_figure(entries)}
+    of_page = {"url": url, "page_file": REPORT, "noun": noun, "document": "", "stamp": stamp}
+    return fill("index.html", {"film": None, "sweep_picture": "", **of_sweep, **of_batch, **of_page, **content})
 
 
-def words(entries: list[BatchEntry]) -> str:
-    """Return the results of the batch in one sentence."""
+def words(entries: list[BatchEntry], noun: str = "scenes") -> str:
+    """Return the results of the batch in one sentence; noun : what the entries are."""
     finished = [entry for entry in entries if not entry.failure]
-    sentence = f"{len(finished)} of {len(entries)} scenes are finished"
+    sentence = f"{len(finished)} of {len(entries)} {noun} are finished"
     distrusted = [entry.title for entry in finished if entry.heading == "not to be trusted"]
     if distrusted:
         sentence += f"; not to be trusted: {', '.join(distrusted)}"

@@ -12,9 +12,10 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 from ommatid.analysis.study import remove_study
-from ommatid.batch.frames import FrameOptions
+from ommatid.batch.film import cached_film
+from ommatid.batch.frames import Frame, FrameOptions
 from ommatid.batch.remote import SILENT
-from ommatid.page.batch_index import INDEX, cached_index
+from ommatid.page.batch_index import INDEX, cached_index, write_film_index
 from ommatid.page.cached import REPORT
 from ommatid.reconstruct.output import result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture, clear_formats
@@ -198,6 +199,20 @@ class ReportOutcome:
     folders: tuple[Path, ...]
     index: Path | None
     warnings: tuple[str, ...]
+
+
+def finish_film(
+    folder: Path, frames: Sequence[tuple[Frame, RunReport | None, str]], options: FrameOptions
+) -> tuple[Path, str]:
+    """Write film.gif and index.html of frames that are reconstructed; return the index, and in words what is shown.
+
+    frames : with the report of each, or the reason of its failure
+    """
+    finished = [frame for frame, report, _ in frames if report is not None]
+    with occupied(folder):
+        film = cached_film(folder, finished, options) if finished else None
+        reports = [(frame.output.stem, report, failure) for frame, report, failure in frames]
+        return write_film_index(folder, reports, film), "" if film is None else f"{film.path}, {film.words}"
 
 
 def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOutcome:

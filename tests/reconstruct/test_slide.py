@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ommatid.figures.panels import FigurePanel
-from ommatid.reconstruct.output import run_json, slide
-from ommatid.reconstruct.output.overview import result_panels
+from ommatid.reconstruct.output import slide
+from ommatid.reconstruct.output.overview import placed_sub_image, result_panels
 from ommatid.reconstruct.output.result_files import read_estimate
 from ommatid.scenes import stack as stack_file
 
@@ -23,8 +23,7 @@ from ..conftest import Command
 def panels(finished: Path) -> dict[str, FigurePanel]:
     found = result_panels(read_estimate(finished / "estimate.exr").channels)
     stack = stack_file.read(finished / "stack.exr")
-    sub_image: Any = slide._sub_image  # pyright: ignore[reportPrivateUsage]
-    return {**found, "sub-image": sub_image(stack, run_json.read(finished), found["estimate"].scale)}
+    return {**found, "sub-image": placed_sub_image(stack, None, found["estimate"].scale)}
 
 
 def test_a_sub_image_stands_where_it_looks_at(panels: dict[str, FigurePanel]) -> None:

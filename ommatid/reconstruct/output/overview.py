@@ -112,3 +112,15 @@ def _sub_images(stack: Stack, grey: FigureScale) -> list[FigurePanel]:
         title = f"{name}\nmagnification {1 / lens_type.ratio}{masked}"
         panels.append(FigurePanel(title, image, grey, "sensor pixels"))
     return panels
+
+
+def placed_sub_image(stack: Stack, name: str | None, grey: FigureScale) -> FigurePanel:
+    """Return a sub-image, as bright as f, where it looks at; name : None for the middle one of the finest type."""
+    camera = stack.camera
+    if name is None:
+        finest = min(camera.types, key=lambda lens_type: lens_type.ratio)
+        name = camera.sub_imager(camera.types.index(finest), finest.array[0] // 2, finest.array[1] // 2).name
+    [(sub, image)] = [pair for pair in zip(camera.sub_imagers, stack.images(), strict=True) if pair[0].name == name]
+    place = float(sub.window[0]), float(sub.window[1]), float(sub.type.ratio)
+    title = f"Sub-image {name}\nmagnification {1 / sub.type.ratio}"
+    return FigurePanel(title, image / float(sub.type.light), grey, place=place)

@@ -22,13 +22,11 @@ from ommatid.runtime.errors import InputError, naming_source, shortened
 from ommatid.runtime.outputs.kinds import check_output
 from ommatid.runtime.printable import printable_label
 from ommatid.scenes import stack as stack_file
-from ommatid.scenes.stack import Stack
 
 from ..restore import check_region
 from . import run_json
-from .overview import result_panels
+from .overview import placed_sub_image, result_panels
 from .result_files import ESTIMATE, Region, read_estimate
-from .run_json import RunReport
 
 PANELS = ("truth", "sub-image", "estimate", "error", "deviation")
 STACK = "stack.exr"
@@ -59,10 +57,10 @@ def write_slide(
         if not (folder / name).is_file():
             raise InputError(f"{folder}: expected the folder of a run, got one without {name}; run a scene first")
         check_output(path, folder / name)
-    report, channels = run_json.read(folder), read_estimate(folder / ESTIMATE).channels
     stack = stack_file.read(folder / STACK)
-    panels = result_panels(channels)
-    panels["sub-image"] = _sub_image(stack, report, panels["estimate"].scale)
+    panels = result_panels(read_estimate(folder / ESTIMATE).channels)
+    best = run_json.read(folder).error.baseline
+    panels["sub-image"] = placed_sub_image(stack, best and best.sub_imager, panels["estimate"].scale)
     missing = [name for name in chosen if name not in panels]
     if missing:
         rest = ", ".join(name for name in PANELS if name in panels)
@@ -81,18 +79,6 @@ def _known(names: Sequence[str]) -> tuple[str, ...]:
         if name not in PANELS:
             raise InputError(f"--panels: expected some of {', '.join(PANELS)}, got '{shortened(name)}'")
     return tuple(dict.fromkeys(names))
-
-
-def _sub_image(stack: Stack, report: RunReport, grey: FigureScale) -> FigurePanel:
-    """Return the best sub-image where the truth is known, else the middle one of the finest type, where it looks at."""
-    camera, best = stack.camera, report.error.baseline
-    finest = min(camera.types, key=lambda lens_type: lens_type.ratio)
-    middle = camera.sub_imager(camera.types.index(finest), finest.array[0] // 2, finest.array[1] // 2).name
-    wanted = middle if best is None else best.sub_imager
-    [(sub, image)] = [pair for pair in zip(camera.sub_imagers, stack.images(), strict=True) if pair[0].name == wanted]
-    place = float(sub.window[0]), float(sub.window[1]), float(sub.type.ratio)
-    title = f"Sub-image {sub.name}\n{'best, ' if best else ''}magnification {1 / sub.type.ratio}"
-    return FigurePanel(title, image / float(sub.type.light), grey, place=place)
 
 
 def _cropped(panel: FigurePanel, region: Region) -> FigurePanel:

@@ -17,7 +17,22 @@ from ..printable import printable
 
 # Suffixes of all files that are written; a folder may hold anything else.
 SUFFIXES = frozenset(
-    (".exr", ".npz", ".npy", ".png", ".svg", ".pdf", ".tiff", ".json", ".jsonl", ".csv", ".md", ".html", ".toml")
+    (
+        ".exr",
+        ".npz",
+        ".npy",
+        ".png",
+        ".gif",
+        ".svg",
+        ".pdf",
+        ".tiff",
+        ".json",
+        ".jsonl",
+        ".csv",
+        ".md",
+        ".html",
+        ".toml",
+    )
 )
 LONGEST = 200  # bytes of a name: 255, less what is added to the names of temporary files
 SHORT = 110  # characters of each of two paths in one sentence

@@ -30,6 +30,7 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.messages import known_keys
 from ommatid.simulate.renderer.variant import unusable_reason
 
+from . import commands_page
 from .conftest import Command, shell
 from .documentation import (
     PAGES,
@@ -73,7 +74,7 @@ TILE = [
 SHORTER = {
     "run misaligned": [*QUICK, *INDEPENDENT, "--set", 'study.models=["ideal","true"]'],
     "run corridor": [*QUICK, *SCALAR, "--set", "target.shape=[19, 19]"],
-    "bench": ["--seconds", "5"],
+    "bench": ["--within", "5 s"],
     "run tile19 -o sweep": [*QUICK, *SCALAR, "--set", "calibration.method=ideal", "--workers", "1"],
     "run tile19 -o auto": SCALAR,
     "run tile19 -o displaced": QUICK,
@@ -380,24 +381,14 @@ def test_starter_scene_has_every_key() -> None:
         assert re.search(rf"^(# )?\[*({re.escape(key)}|{last})\b", starter, flags=re.MULTILINE), key
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_every_command_and_option_is_documented_and_has_help(command: str, ommatid: Command) -> None:
-    page = DOCS / "commands.md"
-    assert f"`ommatid {command}" in text_of(page).split("## ")[0]
-    own = next(text for heading, text in sections(page) if f"`{command}`" in heading)
-    documented = " ".join(code_spans(own + section(page, "Options of many commands"))).replace("=", " ").split()
-    for parameter in COMMANDS[command].params:
-        for option in (*parameter.opts, *parameter.secondary_opts):
-            assert not option.startswith("-") or option in documented, option
-    assert "Usage" in ommatid(command, "--help").out
-
-
-def test_every_documented_option_exists() -> None:
-    commands = [PROGRAM, *COMMANDS.values()]
-    parameters = [parameter for command in commands for parameter in command.params]
+def test_the_tables_of_the_commands_page_are_those_of_the_option_objects() -> None:
+    """`python -m tests.commands_page` writes them anew."""
+    text = text_of(commands_page.PAGE)
+    assert commands_page.with_tables(text) == text
+    parameters = [parameter for command in (PROGRAM, *COMMANDS.values()) for parameter in command.params]
     known = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
-    for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", prose(DOCS / "commands.md")):
-        assert option in known | {"--help"}, option
+    for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", prose(commands_page.PAGE)):
+        assert option in known, option
 
 
 def test_messages_of_the_troubleshooting_page_occur_in_the_program() -> None:

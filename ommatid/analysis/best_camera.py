@@ -282,7 +282,7 @@ def _check(scene: Scene, camera: Camera) -> None:
     if camera.has_surfaces and camera.with_grid_of_matrix.unknowns <= MOST_DENSE:
         raise InputError(
             f"{where}: the bound takes lenses with surfaces in front of more than {MOST_DENSE} pixels, got"
-            f" {camera.unknowns}; rank types with --candidates"
+            f" {camera.unknowns}; compare scenes with `ommatid predict A B`"
         )
     if not scene.has_noise:
         raise InputError(f"{where}: without noise every mixture is exact or has a null space; set noise.variance")

@@ -57,7 +57,7 @@ def next_steps(report: RunReport, other: AnotherType | None = None) -> list[Next
         part = budget.get(name, 0.0)
         steps.append(NextStep(words, how, now - (1 - factor) * part, is_bound=True))
     if other is not None:
-        how = f"{other.measurements} measurements more; `ommatid design --candidates` ranks others"
+        how = f"{other.measurements} measurements more; `ommatid design` chooses among all"
         words = f"another lens type, of magnification {other.magnification} on the pixel grid"
         steps.append(NextStep(words, how, _with_other_type(report, other)))
     useful = [step for step in steps if step is not None and step.mse <= (1 - LEAST_GAIN) * now]

@@ -1,12 +1,13 @@
-"""A prediction as JSON, and as the rows of the table that `predict` prints."""
+"""A prediction as JSON, and as the rows of the tables that `predict` prints: of one scene, and of several compared."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields
 from typing import Any
 
 from ommatid.reconstruct.measured_error import TRIM
-from ommatid.reconstruct.output.verdict_words import error_words
+from ommatid.reconstruct.output.verdict_words import cause, error_words
 from ommatid.reconstruct.prediction import Prediction
 
 DIGITS = 6  # of an expected error
@@ -25,6 +26,51 @@ def json_of(prediction: Prediction) -> dict[str, Any]:
     if prediction.interval is not None:
         values["interval"] = dict(zip(("low", "high"), prediction.interval, strict=True))
     return values | {"assumes": list(prediction.assumes), "recovers_nothing": prediction.recovers_nothing}
+
+
+def prediction_of(document: Mapping[str, Any]) -> Prediction:
+    """Return the prediction that `json_of` described."""
+    values = {field.name: document[field.name] for field in fields(Prediction) if field.name in document}
+    values |= {name: values[name]["mse"] for name in ("as_designed", "calibrated") if name in values}
+    if "interval" in values:
+        values["interval"] = (values["interval"]["low"], values["interval"]["high"])
+    return Prediction(**{**values, "assumes": tuple(values["assumes"])})
+
+
+def compared(predictions: Sequence[Prediction]) -> list[tuple[str, ...]]:
+    """Return names of quantities and their values for each prediction, without quantities that none of them has."""
+    named = dict.fromkeys(name for each in predictions for name in each.budget or {})
+    parts = [(f"  from {cause(name)}", _part(name)) for name in named]
+    lines = [(name, *map(words, predictions)) for name, words in (*ERRORS, *parts, *OTHERS)]
+    return [line for line in lines if any(line[1:])]
+
+
+def _if_known(value: float | None, digits: int = 4) -> str:
+    return "" if value is None else f"{value:.{digits}g}"
+
+
+def _part(name: str) -> Callable[[Prediction], str]:
+    return lambda of: _if_known((of.budget or {}).get(name) or None, 3)
+
+
+Quantities = tuple[tuple[str, Callable[[Prediction], str]], ...]
+ERRORS: Quantities = (
+    ("RMS error, grey levels", lambda of: f"{of.mse**0.5:.4g}"),
+    ("squared error (MSE)", lambda of: f"{of.mse:.{DIGITS}g}"),
+)
+OTHERS: Quantities = (
+    ("  of the prior's variance, %", lambda of: _if_known(of.prior_variance and 100 * of.mse / of.prior_variance, 3)),
+    (f"  without a border of {TRIM} pixels", lambda of: _if_known(of.trimmed_mse, DIGITS)),
+    ("  expected for this picture", lambda of: _if_known(of.mse_for_picture, DIGITS)),
+    ("measurements", lambda of: str(of.measurements)),
+    ("unknowns", lambda of: str(of.unknowns)),
+    ("null space, dimensions", lambda of: "" if of.null_space is None else str(of.null_space)),
+    ("condition of H", lambda of: _if_known(of.condition)),
+    ("degrees of freedom", lambda of: f"{of.degrees_of_freedom:.6g}"),
+    ("resolution, pixels of f", lambda of: _if_known(of.resolution, 3)),
+    ("form of the estimator", lambda of: of.method),
+    ("assumes", lambda of: "; ".join(of.assumes)),
+)
 
 
 def rows(prediction: Prediction) -> list[tuple[str, str]]:

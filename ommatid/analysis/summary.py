@@ -18,6 +18,10 @@ from ommatid.scenes.setup import Setup
 from .lens_table import AXIS_AND_RIM, lens_rows
 
 Section = tuple[str, Sequence[tuple[str, ...]]]  # title and rows, whose first cell names the others
+SHORT = (  # names of the quantities of lens types that `show` prints without -v
+    *("magnification", "on the sensor", "sub-images", "pixels of each", "field of view, °", "focal length, mm"),
+    *("lens to sensor, mm", "f-number", "Airy disk, pixels", "sharp, mm", "contrast at Nyquist/2"),
+)
 METHODS = {
     "dense": "one dense problem",
     "fit": "one dense problem, H fitted to the stack",
@@ -185,6 +189,33 @@ def sections(description: dict[str, Any]) -> list[Section]:
         ("What will run", stages),
         ("What is left out, and why", skipped),
     ]
+
+
+def short_lines(description: dict[str, Any]) -> list[str]:
+    """Return the title, and target, lenses and measurements in a line."""
+    target, camera = description["target"], description["camera"]
+    pitch = target["width"] / target["columns"]
+    return [
+        description["title"] or "Camera",
+        f"{target['rows']} x {target['columns']} pixels of {pitch:.4g} mm at {target['distance']:g} mm;"
+        f" {camera['lenses']} lenses, total track {camera['total_track']:.4g} mm;"
+        f" {description['measurements']} measurements for {description['unknowns']} unknowns",
+    ]
+
+
+def short_section(description: dict[str, Any]) -> Section:
+    """Return the table of lens types with the quantities that decide."""
+    types = description["lens_types"]
+    rows = [row for row in lens_rows(types, description.get("optics", ())) if row[0] in SHORT]
+    light = description.get("light", {}).get("lens_types", ())
+    electrons = [("electrons at 255", *(f"{each['white']:.4g}" for each in light))] if light else []
+    return "Lens types", [("lens type", *(lens["name"] for lens in types)), *rows, *electrons]
+
+
+def left_out_line(description: dict[str, Any]) -> str:
+    """Return what is left out, in a line."""
+    names = ", ".join(skip["what"] for skip in description["skipped"]) or "nothing"
+    return f"left out: {names}; -v prints why, the plan and all quantities"
 
 
 def _camera_rows(description: dict[str, Any]) -> list[tuple[str, str]]:

@@ -1,7 +1,8 @@
 """The scenes of a batch: one for every combination of swept values, each with its own folder, and the shares of jobs.
 
 `--sweep noise.variance=1e-6,1e-4 --sweep camera.lens.I.magnification=1/2,1/3` makes four scenes of one. Values are
-read like those of `--set`. `--job I/N` takes every N-th scene of this list, from the I-th on.
+read like those of `--set`, and dots stand for values between (`series`). `--job I/N` takes every N-th scene of this
+list, from the I-th on.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pydantic import ValidationError
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.outputs.kinds import check_name, shortened_name
 from ommatid.scenes.scene import read
+from ommatid.scenes.tables.series import continued
 
 from .batch import Member
 
@@ -44,7 +46,7 @@ def sweep_axes(options: Iterable[str]) -> tuple[SweepAxis, ...]:
     axes: list[SweepAxis] = []
     for option in options:
         key, equals, text = (part.strip() for part in option.partition("="))
-        values = tuple(_split(text))
+        values = _values(text, option)
         if not key or not equals or not all(values):
             raise InputError(
                 f"--sweep {shortened(option)}: expected KEY=VALUE,VALUE,... without an empty value, {EXAMPLE}"
@@ -57,6 +59,13 @@ def sweep_axes(options: Iterable[str]) -> tuple[SweepAxis, ...]:
             raise InputError(f"--sweep {option}: expected every key once, got it twice; join its values by commas")
         axes.append(SweepAxis(key, values))
     return tuple(axes)
+
+
+def _values(text: str, option: str) -> tuple[str, ...]:
+    try:
+        return tuple(continued(_split(text)))
+    except ValueError as error:
+        raise InputError(f"--sweep {shortened(option)}: {error}") from error
 
 
 def members(

@@ -191,5 +191,5 @@ def rows(table: BenchTable) -> list[tuple[str, str]]:
     lines.append(("cells", f"{len(table.cells)} in {table.seconds:.0f} s, compared with {table.against}"))
     late = sum(job.late for job in table.left_out)
     if late:
-        lines.append(("left out", f"{late} cells that did not fit into {table.budget:g} s; raise --seconds"))
+        lines.append(("left out", f"{late} cells that did not fit into {table.budget:g} s; raise --within"))
     return lines

@@ -25,6 +25,7 @@ from ommatid.runtime.versions import command_line
 
 from . import calibrate, output, predict, reconstruct, run, show, studies
 from .failures import exit_code_of
+from .groups import grouped
 
 ERRORS = "ommatid.ascii"
 # what a terminal without Unicode shows in place of the characters that this program prints
@@ -51,13 +52,12 @@ for command in (
     reconstruct.figure,
     reconstruct.check,
 ):
-    with_arguments()(command)
-with_arguments("import")(calibrate.import_frames)
-with_arguments("export-model")(calibrate.export_model)
-for command in (predict.predict, predict.design, studies.bench, show.show, show.export, show.init):
-    with_arguments()(command)
-for command in (studies.paper, studies.stability, show.schema, show.doctor):
-    app.command()(command)
+    with_arguments()(grouped(command))
+with_arguments("import")(grouped(calibrate.import_frames))
+for command in (predict.predict, predict.design, studies.bench, show.show, show.export):
+    with_arguments()(grouped(command))
+for command in (show.init, studies.paper, studies.stability, show.schema, show.doctor):
+    app.command()(grouped(command))
 
 
 Version = Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)]

@@ -9,21 +9,16 @@ import typer
 
 from . import options, output
 from .options import (
-    AllowOutside,
-    Dark,
-    Flat,
-    FlatValue,
+    Changes,
+    Frames,
     Json,
-    Lenses,
     MoreImages,
-    Origin,
     Output,
     Places,
     Points,
     PointValue,
     SceneFile,
-    Sets,
-    Upright,
+    WorldChanges,
 )
 
 Images = Annotated[
@@ -38,18 +33,12 @@ Images = Annotated[
 def calibrate(
     scene: SceneFile,
     file: Output,
+    frames: Frames,
+    changes: WorldChanges,
     more: MoreImages = None,
     points: Points = None,
     places: Places = None,
     point_value: PointValue = 255,
-    dark: Dark = None,
-    flat: Flat = None,
-    flat_value: FlatValue = 255,
-    origin: Origin = "",
-    upright: Upright = None,
-    sets: Sets = None,
-    lens: Lenses = "",
-    allow_outside: AllowOutside = False,
     as_json: Json = False,
 ) -> None:
     """Find the observation matrix H alone.
@@ -58,43 +47,18 @@ def calibrate(
     """
     from ommatid.pipeline.camera_files import calibrate_file, point_recording
 
-    settings = options.acquisition(dark, flat, flat_value, origin, upright)
     value = options.positive("--point-value", point_value)
-    recording = point_recording(points or (), more or (), places, value, settings)
-    asked = options.changes(sets, allow_outside), options.lens_names(lens)
+    recording = point_recording(points or (), more or (), places, value, frames.settings)
     with output.progress_bar("calibrate") as progress:
-        model, made, warnings = calibrate_file(scene, file, *asked, recording, progress)
+        model, made, warnings = calibrate_file(scene, file, *changes.both, recording, progress)
     output.warn_all(warnings)
     output.say_done("calibrate", made, file)
     sizes = {"measurements": model.measurements, "unknowns": model.unknowns, "entries": model.entries}
     output.print_result({"file": str(file), **sizes, **model.record}, [], as_json)
 
 
-def export_model(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A model that calibrate or run wrote (.npz).")],
-    file: Output,
-    as_json: Json = False,
-) -> None:
-    """Write the observation matrix H of a model as a matrix for scipy.sparse.load_npz."""
-    from ommatid.pipeline.camera_files import export_matrix
-
-    description = export_matrix(model, file)
-    output.say_done("export-model", True, file)
-    output.print_result({"file": str(file), **description}, [], as_json)
-
-
 def import_frames(
-    scene: SceneFile,
-    images: Images,
-    file: Output,
-    dark: Dark = None,
-    flat: Flat = None,
-    flat_value: FlatValue = 255,
-    origin: Origin = "",
-    upright: Upright = None,
-    sets: Sets = None,
-    lens: Lenses = "",
-    as_json: Json = False,
+    scene: SceneFile, images: Images, file: Output, frames: Frames, changes: Changes, as_json: Json = False
 ) -> None:
     """Cut recorded frames of a real camera into a stack.
 
@@ -102,9 +66,7 @@ def import_frames(
     """
     from ommatid.pipeline.camera_files import import_file
 
-    settings = options.acquisition(dark, flat, flat_value, origin, upright)
-    asked = options.changes(sets), options.lens_names(lens)
-    description, warnings = import_file(scene, images, file, settings, *asked)
+    description, warnings = import_file(scene, images, file, frames.settings, *changes.both)
     output.warn_all(warnings)
     output.say_done("import", True, file)
     output.print_result({"file": str(file), **description}, [], as_json)

@@ -7,29 +7,38 @@ results that are not to be trusted.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from ommatid.runtime.errors import InputError, MachineError, NotStartedError
+from ommatid.runtime.errors import InputError, MachineError, NotStartedError, shortened
 from ommatid.runtime.execution.library_warnings import TRACEBACK
 from ommatid.runtime.outputs.kinds import input_error
 from ommatid.runtime.printable import printable
+from ommatid.scenes.tables.gallery import gallery_names
 
 from .output import print_result, say
 
 if TYPE_CHECKING:
     from ommatid.pipeline.batches import BatchOutcome
 
-# Options that are no longer, with what takes their place.
+# Options and commands that are no longer, with what takes their place.
 _TLS = "name the file in Dask's own configuration, as by DASK_DISTRIBUTED__COMM__TLS__"
+_FIGURES = "write --format svg,pdf; text and lines of these files are sharp at any size"
 WITHDRAWN = {
+    "--candidates": 'write --set design.magnifications="1/2,...,1/9", or compare scenes by `ommatid predict A B C`',
     "--complete": "write --set render.complete=true",
+    "--figure-dpi": _FIGURES,
+    "--figure-format": _FIGURES,
+    "--list": "`ommatid init` alone lists the scenes of the gallery",
+    "--seconds": 'write --within "240 s"',
     "--tls-ca": f"{_TLS}CA_FILE",
     "--tls-cert": f"{_TLS}CLIENT__CERT",
     "--tls-key": f"{_TLS}CLIENT__KEY",
 }
+WITHDRAWN_COMMANDS = {"export-model": "write `ommatid export model.npz -o H.npz`"}
 
 NOT_TRUSTED = 3  # exit code of --strict
 INTERRUPTED = 130  # exit code of a command stopped by Ctrl-C
@@ -81,10 +90,7 @@ def report(error: Exception) -> int:
     if isinstance(error, NotStartedError):
         return 1
     if hasattr(error, "format_message"):  # raised by the parser of the command line
-        message = cast(Any, error).format_message()
-        option = getattr(error, "option_name", "")
-        if option in WITHDRAWN:
-            message = f"{option}: this option is withdrawn; {WITHDRAWN[option]}"
+        message = _parser_message(cast(Any, error))
         if type(error).__name__ == "NoArgsIsHelpError":
             print(message, file=sys.stderr)
         else:
@@ -103,6 +109,22 @@ def report(error: Exception) -> int:
         what = printable(f"{type(error).__name__}: {error}")
         say(f"ommatid: unexpected {what}; set {TRACEBACK}=1 to see where, and report it")
     return 1
+
+
+def _parser_message(error: Any) -> str:
+    """Return the sentence of an error in the command line itself, with what takes the place of what is withdrawn."""
+    option, message = getattr(error, "option_name", ""), str(error.format_message())
+    if option in WITHDRAWN:
+        return f"{option}: this option is withdrawn; {WITHDRAWN[option]}"
+    match = re.match(r"No such command '(.*?)'\.", message, re.DOTALL)
+    if match is None:
+        return message
+    name = match[1]
+    if name in WITHDRAWN_COMMANDS:
+        return f"{name}: this command is withdrawn; {WITHDRAWN_COMMANDS[name]}"
+    if name in gallery_names() or name.endswith(".toml"):
+        return f"{shortened(name)}: expected a command before the scene, as in: ommatid run {shortened(name)}"
+    return message
 
 
 def _delivered(code: int) -> int:

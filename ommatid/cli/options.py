@@ -1,7 +1,8 @@
-"""Options that several commands share, and the values that follow from them."""
+"""Options that several commands share, single ones and groups, and the values that follow from them."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,8 +11,11 @@ import typer
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.scenes.tables.gallery import gallery_names
 
+from .output import Detail
+
 if TYPE_CHECKING:
     from ommatid.figures.saving import FigureFiles
+    from ommatid.reconstruct.output.estimate_formats import Format
     from ommatid.runtime.execution.cluster import Cluster
     from ommatid.scenes.hardware.frames import AcquisitionSettings
 
@@ -20,102 +24,185 @@ LARGEST_PIXEL = 2**31  # number of a row or a column
 LARGEST_VALUE = 1e12  # of a pixel, as in a scene file
 _SCENE = f"A scene file, or a scene of the gallery by name: {', '.join(gallery_names())}."
 
+SceneOrModel = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SCENE|MODEL", help=f"A model that ommatid wrote (.npz). Or: {_SCENE}", autocompletion=gallery_names
+    ),
+]
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help=_SCENE, autocompletion=gallery_names)]
 SceneFiles = Annotated[list[Path], typer.Argument(metavar="SCENE...", help=_SCENE, autocompletion=gallery_names)]
 Folder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")]
+FolderIfAny = Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")]
 Output = Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="File to write.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else.")]
-Sets = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Change a key, as in noise.variance=1e-6; empty removes it. Files are relative to the current folder.",
-    ),
-]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Print the whole table of every result.")]
-Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print the verdict alone, and no progress.")]
-Force = Annotated[bool, typer.Option("--force", help="Make everything again, even if it is up to date.")]
+Force = Annotated[bool, typer.Option("--force", help="Make again what is up to date.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would be done; write nothing.")]
 Formats = Annotated[
     str,
-    typer.Option("--format", metavar="NAME,...", help="Write the estimate also as npy, tiff16 or tiff32."),
-]
-Lenses = Annotated[
-    str, typer.Option("--lens", metavar="NAME,...", help="Use these lens types only; a type named twice is used twice.")
-]
-AllowOutside = Annotated[
-    bool, typer.Option("--allow-outside", help="Let a world name files outside the folder of its own file.")
+    typer.Option(
+        "--format",
+        metavar="NAME,...",
+        help="Write figures also as svg or pdf, and the estimate as npy, tiff16 or tiff32.",
+    ),
 ]
 Sweeps = Annotated[
     list[str] | None,
     typer.Option(
         "--sweep",
         metavar="KEY=VALUE,...",
-        help="One scene per value, as in noise.variance=1e-6,1e-4; several options: every combination.",
+        help="One scene per value, as in noise.bits=8,...,12; several: every combination.",
     ),
 ]
-Scheduler = Annotated[
-    str, typer.Option("--scheduler", metavar="ADDRESS", help="Send the scenes to this Dask cluster: tcp://host:port.")
-]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        "--workers", metavar="N", min=1, max=MOST_WORKERS, help="Number of processes (default: chosen automatically)."
-    ),
-]
-Job = Annotated[
-    str, typer.Option("--job", metavar="I/N", help="Run every N-th scene, from the I-th on; /N in a job array.")
-]
-Strict = Annotated[
-    bool, typer.Option("--strict", help="Exit with code 3 if the results are not to be trusted; they are written.")
-]
+Strict = Annotated[bool, typer.Option("--strict", help="Exit with code 3 if a result is not to be trusted.")]
 Within = Annotated[
-    str, typer.Option("--within", metavar="TIME", help='Find the best result within a time, such as "30 s".')
+    str, typer.Option("--within", metavar="TIME", help='Do what is best within a time, such as "30 s" or "4 min".')
 ]
-FigureFormats = Annotated[
-    str, typer.Option("--figure-format", metavar="NAME,...", help="Write figures also in these formats: svg, pdf.")
-]
-FigureResolution = Annotated[
-    int,
-    typer.Option("--figure-dpi", metavar="N", min=20, max=1200, help="Dots per inch of PNG figures; 300 for slides."),
-]
-SCREEN = 110  # dots per inch
 
-# Recorded frames
-Dark = Annotated[
-    list[Path] | None,
-    typer.Option("--dark", metavar="FILE", help="Frame without light, or a folder; several are averaged."),
-]
-Flat = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--flat",
-        metavar="FILE",
-        help="Frame of a uniform target, or a folder: values become (image - dark)/(flat - dark).",
-    ),
-]
-FlatValue = Annotated[
-    float, typer.Option("--flat-value", metavar="VALUE", help="Value of the target of --flat, in units of f.")
-]
-Origin = Annotated[
-    str,
-    typer.Option(
-        "--origin",
-        metavar="ROW,COLUMN",
-        help="Pixel of the mosaic, from 0, at the top left corner of the first sub-image's patch"
-        " (default: the middle of the mosaic is the camera's axis).",
-    ),
-]
-Upright = Annotated[
-    bool | None,
-    typer.Option(
-        "--upright/--turned",
-        help="Sub-images are upright, or rotated by 180 degrees as by lenses"
-        " (default: rotated in a mosaic, upright in one picture per sub-imager).",
-        show_default=False,
-    ),
-]
+
+@dataclass(frozen=True)
+class Changes:
+    """Changes of a scene: its keys, and the lens types that are kept."""
+
+    sets: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Change a key, as in noise.variance=1e-6 or camera.lens.*.f_number=4; empty removes it.",
+        ),
+    ] = None
+    lens: Annotated[
+        str,
+        typer.Option("--lens", metavar="NAME,...", help="Use these lens types only; one named twice is used twice."),
+    ] = ""
+
+    @property
+    def both(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The changes of keys, and the names of `--lens`, empty without the option."""
+        return tuple(self.sets or ()), tuple(name.strip() for name in self.lens.split(",")) if self.lens else ()
+
+
+@dataclass(frozen=True)
+class WorldChanges(Changes):
+    """Changes of a scene whose world is read."""
+
+    allow_outside: Annotated[
+        bool, typer.Option("--allow-outside", help="Let a world name files outside the folder of its own file.")
+    ] = False
+
+    @property
+    def both(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The changes of keys, that of `--allow-outside` the last, and the names of `--lens`."""
+        sets, lenses = super().both
+        return (*sets, *(("--allow-outside",) if self.allow_outside else ())), lenses
+
+
+@dataclass(frozen=True)
+class Printing:
+    """How much is printed of a result."""
+
+    verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Print all that is known of every result.")] = False
+    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Print one line of every result, no progress.")] = False
+    as_json: Json = False
+
+    @property
+    def detail(self) -> Detail | None:
+        """How much is printed, None for JSON. Raises InputError for `-v` and `-q` together."""
+        if self.verbose and self.quiet:
+            raise InputError("-v and -q: expected one of them, got both")
+        return None if self.as_json else "table" if self.verbose else "verdict" if self.quiet else "summary"
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Where the work is done."""
+
+    scheduler: Annotated[
+        str,
+        typer.Option(
+            "--scheduler", metavar="ADDRESS", help="Send scenes or tiles to this Dask cluster: tcp://host:port."
+        ),
+    ] = ""
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers",
+            metavar="N",
+            min=1,
+            max=MOST_WORKERS,
+            help="Distribute scenes, stacks or tiles over N processes.",
+        ),
+    ] = None
+
+    @property
+    def pool(self) -> tuple[Cluster | None, int | None]:
+        """The cluster of `--scheduler`, None without the option, and the number of processes."""
+        from ommatid.runtime.execution.cluster import Cluster
+
+        return Cluster(self.scheduler) if self.scheduler else None, self.workers
+
+
+@dataclass(frozen=True)
+class Jobs(Processes):
+    """Where the scenes of a batch are run."""
+
+    job: Annotated[
+        str, typer.Option("--job", metavar="I/N", help="Run every N-th scene, from the I-th on; /N in a job array.")
+    ] = ""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """How frames of a real camera were recorded."""
+
+    dark: Annotated[
+        list[Path] | None,
+        typer.Option("--dark", metavar="FILE", help="Frame without light, or a folder; several are averaged."),
+    ] = None
+    flat: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--flat",
+            metavar="FILE",
+            help="Frame of a uniform target, or a folder: values become (image - dark)/(flat - dark).",
+        ),
+    ] = None
+    flat_value: Annotated[
+        float, typer.Option("--flat-value", metavar="VALUE", help="Value of the target of --flat, in units of f.")
+    ] = 255
+    origin: Annotated[
+        str,
+        typer.Option(
+            "--origin",
+            metavar="ROW,COLUMN",
+            help="Pixel of the mosaic, from 0, at the top left corner of the first sub-image"
+            " (default: the camera's axis is in the middle).",
+        ),
+    ] = ""
+    upright: Annotated[
+        bool | None,
+        typer.Option(
+            "--upright/--turned",
+            help="Sub-images are upright, or rotated by 180 degrees (default: rotated in a mosaic).",
+            show_default=False,
+        ),
+    ] = None
+
+    @property
+    def settings(self) -> AcquisitionSettings:
+        """The options as settings. Raises InputError for an origin or a value that cannot be."""
+        from ommatid.scenes.hardware.frames import AcquisitionSettings
+
+        corner = None
+        if self.origin:
+            row, column = _integers("--origin", self.origin, "ROW,COLUMN", "12,8")
+            corner = row, column
+        value = positive("--flat-value", self.flat_value)
+        return AcquisitionSettings(tuple(self.dark or ()), tuple(self.flat or ()), value, corner, self.upright)
+
+
+# Recorded point sources
 MoreImages = Annotated[
     list[Path] | None, typer.Argument(metavar="IMAGE...", help="More images of --points.", show_default=False)
 ]
@@ -140,49 +227,41 @@ PointValue = Annotated[
 ]
 
 
-def lens_names(lens: str) -> tuple[str, ...]:
-    """Split the names of `--lens`; empty without the option."""
-    return tuple(name.strip() for name in lens.split(",")) if lens else ()
+def figure_files(text: str) -> FigureFiles:
+    """Read the formats of figures that `--format` names beside PNG. Raises InputError for other names."""
+    names = formats(text)
+    if names[0]:
+        raise InputError(f"--format {shortened(text)}: no estimate is written here; expected svg, pdf or both")
+    return names[1]
 
 
-def changes(sets: list[str] | None, allow_outside: bool = False) -> tuple[str, ...]:
-    """Collect the changes of `--set` and `--allow-outside`, in the order in which they apply."""
-    return (*(sets or ()), *(("--allow-outside",) if allow_outside else ()))
+def formats(text: str) -> tuple[tuple[Format, ...], FigureFiles]:
+    """Read the formats of the estimate and those of figures, PNG and others, that `--format` names.
+
+    Raises InputError for an unknown name.
+    """
+    from ommatid.figures.saving import FORMATS, FigureFiles
+    from ommatid.reconstruct.output.estimate_formats import formats_of
+
+    names = list(dict.fromkeys(name.strip().lower() for name in text.split(",") if name.strip()))
+    figures = tuple(dict.fromkeys(("png", *(name for name in names if name in FORMATS))))
+    return formats_of([name for name in names if name not in FORMATS]), FigureFiles(figures)
 
 
-def cluster(scheduler: str) -> Cluster | None:
-    """Return the cluster of `--scheduler`; None without the option."""
-    from ommatid.runtime.execution.cluster import Cluster
+def seconds(within: str) -> float:
+    """Read the time of `--within`. Raises InputError for a text that is no duration."""
+    from ommatid.scenes.tables.units import DURATION
 
-    return Cluster(scheduler) if scheduler else None
-
-
-def figure_files(formats: str, resolution: int, always: str = "png") -> FigureFiles:
-    """Return the files in which a command writes its figures. Raises InputError for an unknown format."""
-    from ommatid.figures.saving import FigureFiles, figure_formats
-
-    return FigureFiles(tuple(dict.fromkeys((always, *(figure_formats(formats) if formats else ())))), resolution)
+    try:
+        return DURATION.read(within)
+    except ValueError as error:
+        raise InputError(f"--within: {error}") from error
 
 
 def region(option: str, text: str) -> tuple[tuple[int, int], tuple[int, int]]:
     """Read the corner and the size of a part of the target. Raises InputError."""
     row, column, rows, columns = _integers(option, text, "ROW,COLUMN,ROWS,COLUMNS", "8,8,4,4")
     return (row, column), (rows, columns)
-
-
-def acquisition(
-    dark: list[Path] | None, flat: list[Path] | None, flat_value: float, origin: str, upright: bool | None
-) -> AcquisitionSettings:
-    """Collect how frames were recorded. Raises InputError for an origin or a value that cannot be."""
-    from ommatid.scenes.hardware.frames import AcquisitionSettings
-
-    corner = None
-    if origin:
-        row, column = _integers("--origin", origin, "ROW,COLUMN", "12,8")
-        corner = row, column
-    return AcquisitionSettings(
-        tuple(dark or ()), tuple(flat or ()), positive("--flat-value", flat_value), corner, upright
-    )
 
 
 def positive(option: str, value: float) -> float:

@@ -8,26 +8,27 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Generator, Iterable
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from ommatid.runtime.errors import InputError
 from ommatid.runtime.printable import LONGEST_MESSAGE, printable, printable_sentence
+from ommatid.runtime.progress import Progress, no_progress
 
 if TYPE_CHECKING:
     from ommatid.analysis.summary import Section
     from ommatid.batch.remote import RunObserver
     from ommatid.reconstruct.output.run_json import RunReport
-    from ommatid.runtime.progress import Progress
 
 Detail = Literal["table", "summary", "verdict"]
 
 LONGEST_LINE = 1000  # characters of a line on stdout, or of a cell of a table
 MOST_WARNINGS = 20  # which are printed of one list
 WIDE = 72  # columns in which a table of several values keeps its names in one line
+SPEED_OVER = 3600.0  # seconds from whose steps the time left follows: a scene may take minutes
 LEAST_WIDTH = 40  # columns of a table; in narrower ones, numbers would be cut off
 
 FILE_OF_STAGE = {"render": "stack.exr", "report": "report.html"}
@@ -96,17 +97,92 @@ def print_tables(sections: Iterable[Section]) -> None:
         console.print(table)
 
 
-@contextmanager
-def progress_bar(stage: str) -> Generator[Progress]:
-    """Show a bar with the time left on stderr, where that is a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+class Bars:
+    """Bars with the time left on stderr, one below the other, where that is a terminal."""
 
-    columns = (TextColumn(f"{stage:10}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(stage, total=1.0)
-        yield lambda fraction: bar.update(task, completed=fraction)
+    def __init__(self, quiet: bool = False) -> None:
+        """Create bars; quiet : True to show none."""
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("{task.description:10}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        console = Console(stderr=True)
+        disabled = quiet or not console.is_terminal
+        self._shown = Progress(
+            *columns,
+            console=console,
+            transient=True,
+            disable=disabled,
+            redirect_stdout=False,  # results never go to stderr
+            speed_estimate_period=SPEED_OVER,
+        )
+
+    @contextmanager
+    def bar(self, stage: str) -> Generator[Progress]:
+        """Show a bar of a stage below those that are there."""
+        if not self._shown.tasks:
+            self._shown.start()
+        task = self._shown.add_task(stage, total=1.0)
+        try:
+            yield lambda fraction: self._shown.update(task, completed=fraction)
+        finally:
+            self._shown.remove_task(task)
+            if not self._shown.tasks:
+                self._shown.stop()
+
+    @contextmanager
+    def hidden(self) -> Generator[None]:
+        """Take the bars away while results are printed."""
+        self._shown.stop()
+        yield
+        if self._shown.tasks:
+            self._shown.start()
+
+
+@contextmanager
+def progress_bar(stage: str, quiet: bool = False) -> Generator[Progress]:
+    """Show a bar with the time left on stderr, where that is a terminal."""
+    with Bars(quiet).bar(stage) as progress:
+        yield progress
+
+
+@dataclass(frozen=True)
+class BatchBars:
+    """The bars of a batch: that of all scenes, if there are several, and that of a stage.
+
+    progress : takes the finished fraction of the scenes
+    """
+
+    bars: Bars
+    progress: Progress
+    alone: bool
+    quiet: bool
+
+    def hidden(self) -> AbstractContextManager[None]:
+        """Take the bars away while results are printed."""
+        return self.bars.hidden()
+
+    def observer(self, folder: Path) -> RunObserver:
+        """Create the observer that shows the progress of a scene in `folder`, and says which stages are done."""
+        from ommatid.batch.remote import RunObserver
+        from ommatid.runtime.machine import seconds_since_start
+
+        def done(stage: str, made: bool) -> None:
+            if not self.quiet:
+                say_done(stage, made, folder / FILE_OF_STAGE[stage] if stage in FILE_OF_STAGE else None)
+
+        return RunObserver(self.bars.bar, done, seconds_since_start if self.alone else None)
+
+
+@contextmanager
+def batch_bars(count: int, quiet: bool = False) -> Generator[BatchBars]:
+    """Show the progress of a batch of so many scenes; quiet : True to show and say nothing."""
+    bars = Bars(quiet)
+    if count == 1:
+        yield BatchBars(bars, no_progress, True, quiet)
+        return
+    with bars.bar(f"{count} scenes") as progress:
+        yield BatchBars(bars, progress, False, quiet)
 
 
 def print_lines(lines: Iterable[str], *, alarm: bool = False) -> None:
@@ -115,13 +191,6 @@ def print_lines(lines: Iterable[str], *, alarm: bool = False) -> None:
         typer.secho(
             printable(line, LONGEST_LINE), fg="red" if alarm and number == 0 else None, bold=alarm and number == 0
         )
-
-
-def detail(verbose: bool, quiet: bool) -> Detail:
-    """Return how much is printed of a result. Raises InputError if both options are given."""
-    if verbose and quiet:
-        raise InputError("-v and -q: expected one of them, got both")
-    return "table" if verbose else "verdict" if quiet else "summary"
 
 
 def print_report(name: str, page: Path | None, report: RunReport, sections: Iterable[Section], detail: Detail) -> None:
@@ -137,24 +206,3 @@ def print_report(name: str, page: Path | None, report: RunReport, sections: Iter
         return
     lines = [verdict_line(name, report)] if detail == "verdict" else summary_lines(name, report, page)
     print_lines(lines, alarm=not is_trusted(report))
-
-
-def observer(folder: Path, *, alone: bool = False, quiet: bool = False) -> RunObserver:
-    """Create the observer that shows the progress of a run in `folder`, and says which stages are done.
-
-    alone : True if the process runs this scene alone, so that its start belongs to the run
-    quiet : True to show and say nothing
-    """
-    from ommatid.batch.remote import RunObserver
-    from ommatid.runtime.machine import seconds_since_start
-    from ommatid.runtime.progress import no_progress
-
-    def done(stage: str, made: bool) -> None:
-        if not quiet:
-            say_done(stage, made, folder / FILE_OF_STAGE[stage] if stage in FILE_OF_STAGE else None)
-
-    def no_bar(stage: str) -> AbstractContextManager[Progress]:
-        del stage
-        return nullcontext(no_progress)
-
-    return RunObserver(no_bar if quiet else progress_bar, done, seconds_since_start if alone else None)

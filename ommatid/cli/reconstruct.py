@@ -13,12 +13,11 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.printable import printable_sentence
 
 from . import failures, options, output
-from .options import FigureResolution, Force, Formats, Json, Lenses, Output, Quiet, Sets, Strict, Verbose
-
-SLIDE = 300  # dots per inch
+from .options import Changes, FolderIfAny, Force, Formats, Json, Output, Printing, Processes, Strict
 
 if TYPE_CHECKING:
     from ommatid.batch.frames import Frame, FrameOptions
+    from ommatid.figures.saving import FigureFiles
     from ommatid.reconstruct.output.run_json import RunReport
     from ommatid.runtime.execution.cluster import Cluster
 
@@ -35,7 +34,7 @@ Estimates = Annotated[
         "-o",
         "--output",
         metavar="DIR|FILE",
-        help="Folder of all results, or an EXR file for the estimate alone; of several stacks the folder of these.",
+        help="Folder of the results, or an EXR file for the estimate alone.",
     ),
 ]
 StackFile = Annotated[Path, typer.Argument(metavar="STACK", help="Recorded sub-images, stack.exr.")]
@@ -43,39 +42,18 @@ ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Their observat
 StackOrFolder = Annotated[
     Path, typer.Argument(metavar="STACK|DIR", help="A folder of results, a folder of such folders, or a stack.")
 ]
-ResultFolder = Annotated[
-    Path | None,
-    typer.Option(
-        "-o", "--output", metavar="DIR", help="Folder of the results of a stack (default: beside it, of its name)."
-    ),
-]
 Regions = Annotated[
     list[str] | None,
     typer.Option(
         "--region",
         metavar="ROW,COLUMN,ROWS,COLUMNS",
-        help="Print the mean of a region with its posterior standard deviation; may be repeated.",
+        help="Print the mean of a region with its error bar; may be repeated.",
         show_default=False,
-    ),
-]
-TileScheduler = Annotated[
-    str, typer.Option("--scheduler", metavar="ADDRESS", help="Send the tiles of a frame to this Dask cluster.")
-]
-TileWorkers = Annotated[
-    int | None,
-    typer.Option(
-        "--workers",
-        metavar="N",
-        min=1,
-        max=options.MOST_WORKERS,
-        help="Distribute several stacks, or the tiles of one, over N processes.",
     ),
 ]
 ScenePrior = Annotated[
     bool,
-    typer.Option(
-        "--scene-prior", help="Assume the scene's prior (default: an independent one is replaced by a fitted one)."
-    ),
+    typer.Option("--scene-prior", help="Keep an independent prior, which is replaced by a fitted one by default."),
 ]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run, such as out/tile19.")]
 Panels = Annotated[
@@ -96,37 +74,33 @@ DarkGround = Annotated[bool, typer.Option("--dark", help="Draw on dark ground, f
 def reconstruct(
     files: StackAndModel,
     file: Estimates,
-    sets: Sets = None,
-    lens: Lenses = "",
+    changes: Changes,
+    processes: Processes,
+    printing: Printing,
     region: Regions = None,
-    scheduler: TileScheduler = "",
-    workers: TileWorkers = None,
     formats: Formats = "",
     force: Force = False,
     strict: Strict = False,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
-    as_json: Json = False,
 ) -> None:
     """Reconstruct from files: one frame, or several of one camera."""
     from ommatid.batch.frames import FrameOptions
-    from ommatid.reconstruct.output.estimate_formats import formats_of
 
-    detail, others = output.detail(verbose, quiet), formats_of(formats)
+    detail, (others, figures) = printing.detail, options.formats(formats)
     *stacks, model = files
-    asked = (
-        options.changes(sets),
-        options.lens_names(lens),
-        tuple(options.region("--region", text) for text in region or ()),
-    )
-    common = FrameOptions(model, *asked, others, force)
-    if len(stacks) != 1:
-        if scheduler:
-            raise InputError("--scheduler: sends the tiles of one stack, got several stacks; take --workers instead")
-        _reconstruct_many(stacks, common, file, workers, strict, None if as_json else detail)
+    regions = tuple(options.region("--region", text) for text in region or ())
+    common = FrameOptions(model, *changes.both, regions, others, force)
+    if len(stacks) == 1:
+        _reconstruct_one(stacks[0], common, file, processes.pool, detail, strict, figures)
         return
-    pool = options.cluster(scheduler), workers
-    _reconstruct_one(stacks[0], common, file, pool, None if as_json else detail, strict)
+    if processes.scheduler:
+        raise InputError("--scheduler: sends the tiles of one stack, got several stacks; take --workers instead")
+    _check_no_figures(figures)
+    _reconstruct_many(stacks, common, file, processes.workers, strict, detail)
+
+
+def _check_no_figures(figures: FigureFiles) -> None:
+    if len(figures.formats) > 1:
+        raise InputError(f"--format {figures.formats[1]}: figures are those of a folder of one result; name it with -o")
 
 
 def _reconstruct_one(
@@ -136,20 +110,27 @@ def _reconstruct_one(
     pool: tuple[Cluster | None, int | None],
     detail: output.Detail | None,
     strict: bool,
+    figures: FigureFiles,
 ) -> None:
     """Reconstruct one stack into a folder or a file, and print the result; None for `detail`: as JSON."""
+    from ommatid.figures.saving import SCREEN_PNG
     from ommatid.pipeline import reconstruction
+    from ommatid.pipeline.stages import write_figures
     from ommatid.reconstruct.output import facts
     from ommatid.reconstruct.output.estimate_formats import write_formats
     from ommatid.reconstruct.output.verdict_words import is_trusted
 
     whole = reconstruction.is_folder(file)
-    with output.progress_bar("reconstruct") as progress:
+    if not whole:
+        _check_no_figures(figures)
+    with output.progress_bar("reconstruct", quiet=detail == "verdict") as progress:
         if whole:
             report, made = reconstruction.reconstruct_folder(stack, common, file, progress, *pool)
         else:
             report, made = reconstruction.reconstruct_files(stack, common, file, progress, *pool), True
     write_formats(file / "estimate.exr" if whole else file, common.formats)
+    if figures != SCREEN_PNG:
+        write_figures(file, figures)
     if detail != "verdict":
         output.say_done("reconstruct", made, file)
     if detail is None:
@@ -182,7 +163,7 @@ def _reconstruct_many(
         raise InputError(f"{common.model}: expected stacks and then their model, got one file; name a stack before it")
     check_index(folder)
     described: dict[Path, DescribedFrame] = {}
-    with output.progress_bar("reconstruct") as progress:
+    with output.progress_bar("reconstruct", quiet=detail == "verdict") as progress:
         for frame, work in reconstruct_frames(stacks, folder, common, workers, progress):
             described[frame.stack] = _described(frame, work, strict, quiet=detail == "verdict")
     frames = [described[stack] for stack in stacks]
@@ -239,7 +220,7 @@ def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict:
     return DescribedFrame(frame, {**heading, **report.plain()}, frame_row(name, report), code, report)
 
 
-def report(path: StackOrFolder, folder: ResultFolder = None, as_json: Json = False) -> None:
+def report(path: StackOrFolder, folder: FolderIfAny = None, as_json: Json = False) -> None:
     """Write the page of what is there: a run, a folder of runs, or a stack."""
     from ommatid.pipeline.reconstruction import report_path
 
@@ -257,7 +238,6 @@ def figure(
     panels: Panels = "",
     crop: Crop = "",
     dark: DarkGround = False,
-    resolution: FigureResolution = SLIDE,
     as_json: Json = False,
 ) -> None:
     """Draw panels of a run for a slide or a paper: .pdf, .svg or .png."""
@@ -265,7 +245,7 @@ def figure(
 
     names = tuple(name.strip() for name in panels.split(",")) if panels else ()
     part = options.region("--crop", crop) if crop else None
-    drawn = write_slide(run, file, names, part, dark, resolution)
+    drawn = write_slide(run, file, names, part, dark)
     output.say(f"{file}: written, {', '.join(drawn)}")
     output.print_result({"file": str(file), "panels": list(drawn)}, [], as_json)
 
@@ -273,8 +253,7 @@ def figure(
 def check(
     stack: StackFile,
     model: ModelFile,
-    sets: Sets = None,
-    lens: Lenses = "",
+    changes: Changes,
     scene_prior: ScenePrior = False,
     strict: Strict = False,
     as_json: Json = False,
@@ -287,7 +266,7 @@ def check(
     from ommatid.batch.frames import FrameOptions
     from ommatid.pipeline.reconstruction import check_held_out_files
 
-    common = FrameOptions(model, options.changes(sets), options.lens_names(lens))
+    common = FrameOptions(model, *changes.both)
     with output.progress_bar("check") as progress:
         report = check_held_out_files(stack, common, fitted=not scene_prior, progress=progress)
     output.print_result(report.plain(), [(f"{stack}, predicted sub-imagers", held_out.rows(report))], as_json)

@@ -10,18 +10,8 @@ import typer
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.tables.gallery import gallery_names
 
-from . import options, output
-from .options import (
-    SCREEN,
-    AllowOutside,
-    FigureFormats,
-    FigureResolution,
-    Json,
-    Lenses,
-    Output,
-    SceneFile,
-    Sets,
-)
+from . import output
+from .options import Changes, Json, Output, Printing, SceneFile, SceneOrModel, WorldChanges
 
 FigureFile = Annotated[
     Path | None, typer.Option("--figure", metavar="FILE", help="Write a drawing of the camera: .png, .svg or .pdf.")
@@ -33,64 +23,66 @@ Source = Annotated[
         "--from", metavar="NAME", help="Scene of the gallery to copy, with its files.", autocompletion=gallery_names
     ),
 ]
-ListScenes = Annotated[bool, typer.Option("--list", help="List the scenes of the gallery with their titles.")]
 
 
-def show(
-    scene: SceneFile,
-    sets: Sets = None,
-    lens: Lenses = "",
-    allow_outside: AllowOutside = False,
-    figure: FigureFile = None,
-    figure_formats: FigureFormats = "",
-    figure_resolution: FigureResolution = SCREEN,
-    as_json: Json = False,
-) -> None:
-    """Show the camera in the terms of optics, the plan, and the skipped effects."""
+def show(scene: SceneFile, changes: WorldChanges, printing: Printing, figure: FigureFile = None) -> None:
+    """Show the camera in the terms of optics, and what is left out; with -v why, and the plan."""
+    from ommatid.analysis import summary
     from ommatid.pipeline.descriptions import describe_scene, focus_curves
     from ommatid.pipeline.sections import scene_sections
     from ommatid.scenes.formats.picture import conversions
     from ommatid.scenes.scene import read
 
-    described = read(scene, options.changes(sets, allow_outside), options.lens_names(lens))
+    detail = printing.detail
+    described = read(scene, *changes.both)
     output.warn_all(conversions(described))
     description = describe_scene(described)
     if figure is not None:
         from ommatid.figures.camera_drawing import write_drawing
-        from ommatid.figures.saving import figure_format
 
-        files = options.figure_files(figure_formats, figure_resolution, figure_format(figure))
-        for path in write_drawing(figure, described, files, focus_curves(described)):
-            output.say(f"{path}: written")
-    output.print_result(description, scene_sections(description), as_json)
+        write_drawing(figure, described, focus_curves(described))
+        output.say(f"{figure}: written")
+    if detail is None:
+        output.print_json(description)
+    elif detail == "table":
+        output.print_tables(scene_sections(description))
+    else:
+        output.print_lines(summary.short_lines(description))
+        if detail == "summary":
+            output.print_tables([summary.short_section(description)])
+            output.print_lines([summary.left_out_line(description)])
     output.warn_all(description["warnings"])
 
 
-def export(scene: SceneFile, file: Output, sets: Sets = None, lens: Lenses = "", as_json: Json = False) -> None:
-    """Write a plain Mitsuba scene of stock sensors."""
+def export(source: SceneOrModel, file: Output, changes: Changes, as_json: Json = False) -> None:
+    """Write a plain Mitsuba scene, or H of a model as a matrix for scipy.sparse.load_npz."""
+    from ommatid.pipeline.camera_files import export_matrix
     from ommatid.pipeline.stages import export_scene
 
-    description = export_scene(scene, file, options.changes(sets), options.lens_names(lens))
-    files = f"{file} and {description['picture']}: {len(description['sensors'])} sensors"
-    output.say(f"{files}; render one with: mitsuba -m scalar_rgb -s 0 {file}")
+    if source.suffix == ".npz":
+        if any(changes.both):
+            raise InputError(f"{source}: --set and --lens change scenes, got a model; leave them out")
+        description = {"file": str(file), **export_matrix(source, file)}
+        output.say_done("export", True, file)
+    else:
+        description = export_scene(source, file, *changes.both)
+        files = f"{file} and {description['picture']}: {len(description['sensors'])} sensors"
+        output.say(f"{files}; render one with: mitsuba -m scalar_rgb -s 0 {file}")
     output.print_result(description, [], as_json)
 
 
-def init(
-    file: NewFile = None, source: Source = "starter", list_scenes: ListScenes = False, as_json: Json = False
-) -> None:
-    """Write a scene file to start from."""
+def init(file: NewFile = None, source: Source = "starter", as_json: Json = False) -> None:
+    """Write a scene file to start from; without FILE list the gallery."""
     from ommatid.scenes.tables.gallery import gallery_titles, write_starter
 
-    if list_scenes:
+    if file is None:
         titles = gallery_titles()
         width = max(map(len, titles))
         scenes = [{"name": name, "title": title} for name, title in titles.items()]
         lines = [f"{name:{width}}  {title}" for name, title in titles.items()]
         output.print_json(scenes) if as_json else output.print_lines(lines)
+        output.say("these are scenes of the gallery; write one by: ommatid init mine.toml --from tile19")
         return
-    if file is None:
-        raise InputError("init: expected the name of the scene file to write, such as mine.toml, got none")
     written = [str(path) for path in write_starter(file, source)]
     output.say(f"{', '.join(written)}: written; next: ommatid run {file} -o out")
     output.print_result({"file": str(file), "files": written}, [], as_json)

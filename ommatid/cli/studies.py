@@ -8,25 +8,13 @@ from typing import Annotated, Literal
 import typer
 
 from . import options, output
-from .options import SCREEN, FigureFormats, FigureResolution, Folder, Json, Lenses, SceneFile, Sets
-
-LONGEST = 1e7  # seconds of a bench
+from .options import Changes, Folder, Formats, Json, SceneFile, Within
 
 Photograph = Annotated[str, typer.Option("--image", metavar="FILE", help="The photograph of Figure 7, or photo:NAME.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the noise in Figure 7.")]
 Which = Annotated[
     Literal["lens-diversity", "multiscale"],
     typer.Option("--which", help="Wood, Rajan and Christensen, or Fu, Litterio, Felzenszwalb and Zia."),
-]
-Seconds = Annotated[
-    float,
-    typer.Option(
-        "--seconds",
-        metavar="N",
-        min=1,
-        max=LONGEST,
-        help="Time for all measurements; those that do not fit are skipped.",
-    ),
 ]
 
 
@@ -35,8 +23,7 @@ def paper(
     which: Which = "lens-diversity",
     image: Photograph = "photo:camera",
     seed: Seed = 0,
-    figure_formats: FigureFormats = "",
-    figure_resolution: FigureResolution = SCREEN,
+    formats: Formats = "",
     as_json: Json = False,
 ) -> None:
     """Compute the paper's figures and claims anew, or the expected errors of a second one."""
@@ -49,7 +36,7 @@ def paper(
         output.print_result(errors, [("Expected errors by pixels of several sizes", multiscale.rows(errors))], as_json)
         return
 
-    figures = options.figure_files(figure_formats, figure_resolution)
+    figures = options.figure_files(formats)
     with output.progress_bar("paper") as progress:
         description = write_paper(folder, image, seed, progress, figures)
     output.print_result(description, [(f"The paper's claims: {folder / 'claims.csv'}", rows(description))], as_json)
@@ -57,8 +44,7 @@ def paper(
 
 def stability(
     folder: Folder = Path("stability"),
-    figure_formats: FigureFormats = "",
-    figure_resolution: FigureResolution = SCREEN,
+    formats: Formats = "",
     as_json: Json = False,
 ) -> None:
     """Count correct digits on stiff and extreme cases, against exact arithmetic."""
@@ -69,7 +55,7 @@ def stability(
     from ommatid.stability.cases import CHANGES, LENSES
     from ommatid.stability.stability import rows, write_stability
 
-    figures = options.figure_files(figure_formats, figure_resolution)
+    figures = options.figure_files(formats)
     tile = GALLERY / "tile19.toml"
     matrices = {name: ideal_matrix(derive(read(tile, CHANGES, lenses))) for name, lenses in LENSES.items()}
     with output.progress_bar("stability") as progress:
@@ -79,12 +65,10 @@ def stability(
 
 def bench(
     scene: SceneFile,
+    changes: Changes,
     folder: Folder = Path("out"),
-    seconds: Seconds = 240,
-    sets: Sets = None,
-    lens: Lenses = "",
-    figure_formats: FigureFormats = "",
-    figure_resolution: FigureResolution = SCREEN,
+    within: Within = "4 min",
+    formats: Formats = "",
     as_json: Json = False,
 ) -> None:
     """Measure error against run time of every stage.
@@ -97,8 +81,8 @@ def bench(
     from ommatid.figures.saving import SCREEN_PNG
     from ommatid.pipeline.stages import open_scene
 
-    figures = options.figure_files(figure_formats, figure_resolution)
-    setup = open_scene(scene, options.changes(sets), options.lens_names(lens))
+    figures, seconds = options.figure_files(formats), options.seconds(within)
+    setup = open_scene(scene, *changes.both)
     with output.progress_bar("bench") as progress:
         table, made = measure(setup, folder, seconds, progress)
     if figures != SCREEN_PNG:

@@ -19,7 +19,7 @@ from ommatid.scenes.geometry.optical_terms import LensTerms, OpticalTerms, Throu
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.scene import Scene
 
-from .saving import COLOURS, INK, SCREEN_PNG, FigureFiles, new_figure, own_style
+from .saving import COLOURS, INK, figure_format, new_figure, own_style, save_figure
 from .sensor_drawing import ARROW, draw_sensor, draw_sub_images, length_words, sensor_aspect, write_beside
 
 WIDTH = 10.0  # inches, as are all lengths of the layout
@@ -68,15 +68,13 @@ def camera_drawing(scene: Scene, camera: Camera, *, described: bool = True, curv
     return figure
 
 
-def write_drawing(
-    path: Path, scene: Scene, files: FigureFiles = SCREEN_PNG, curves: Sequence[ThroughFocus] = ()
-) -> list[Path]:
-    """Write the drawing of a scene's camera, and return its files. Raises MachineError.
+def write_drawing(path: Path, scene: Scene, curves: Sequence[ThroughFocus] = ()) -> None:
+    """Write the drawing of a scene's camera in the format that the file's name says. Raises InputError or MachineError.
 
     curves : as of `camera_drawing`
     """
-    files.save(camera_drawing(scene, derive(scene), curves=curves), path)
-    return files.paths(path)
+    kind = figure_format(path)
+    save_figure(camera_drawing(scene, derive(scene), curves=curves), path, (kind,))
 
 
 def _draw_curves(axes: Any, curves: Sequence[ThroughFocus], camera: Camera, colours: dict[str, str]) -> None:

@@ -19,7 +19,6 @@ from ommatid.runtime.files import write_whole
 
 FORMATS = ("png", "svg", "pdf")
 SCREEN, SLIDE = 110, 300  # dots per inch of PNG files
-COARSEST, FINEST = 20, 1200
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B", "#56B4E9")  # Okabe and Ito; legible on dark, too
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "*")
 INK = "#000000"  # of text and axes, which a page replaces by its own colour
@@ -51,15 +50,6 @@ class FigureFiles:
 
 
 SCREEN_PNG = FigureFiles()
-
-
-def figure_formats(text: str) -> tuple[str, ...]:
-    """Read the names of formats, such as "png,svg". Raises InputError."""
-    names = tuple(dict.fromkeys(name.strip().lower() for name in text.split(",")))
-    for name in names:
-        if name not in FORMATS:
-            raise InputError(f"--figure-format {text}: expected some of {', '.join(FORMATS)}, got '{name}'")
-    return names
 
 
 def figure_format(path: Path) -> str:

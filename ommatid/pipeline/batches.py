@@ -22,6 +22,7 @@ from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.printable import printable_sentence
+from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.formats import picture
 
 from .stages import library_versions, open_member, process_count
@@ -92,6 +93,7 @@ def run_batch(
     report_failure: Callable[[Exception], int],
     cluster: Cluster | None = None,
     workers: int | None = None,
+    progress: Progress = no_progress,
     *,
     sweep_folder: Path | None = None,
     index_folder: Path | None = None,
@@ -113,7 +115,7 @@ def run_batch(
     results: dict[Member, Description] = {}
     failures: dict[Member, str] = {}
     codes = [0]
-    for member, work in batch.run(members, cluster, workers):
+    for number, (member, work) in enumerate(batch.run(members, cluster, workers), 1):
         document = _heading(member, with_folders)
         try:
             results[member] = {**document, **work()}
@@ -122,6 +124,7 @@ def run_batch(
             reason = printable_sentence(error)
             failures[member] = reason or type(error).__name__
             results[member] = {**document, "error": reason, "exit_code": codes[-1]}
+        progress(number / len(members))
     documents = [results[member] for member in members]
     rows = [summary(results[member]) for member in members if member.changes]
     if len(failures) == len(members):  # leaves nothing behind

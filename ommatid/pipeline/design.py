@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ommatid.analysis import design_report, steering
-from ommatid.analysis.best_camera import BestCamera, design_space
-from ommatid.analysis.design import DesignCandidate, DesignComparison, LensCandidate, check_detail, with_lens
+from ommatid.analysis.best_camera import BestCamera, candidates, design_space
+from ommatid.analysis.design import magnifications
 from ommatid.analysis.design_report import FrontPoint, words_of
 from ommatid.analysis.predict import predict_scene
 from ommatid.figures.saving import FigureFiles
@@ -27,32 +25,16 @@ from ommatid.scenes.tables.sensor import NoiseTable
 Rows = list[tuple[str, str]]
 
 
-def compare_lens_types(scene: Scene, magnifications: Sequence[Fraction], progress: Progress) -> DesignComparison:
-    """Predict the error of the scene with one more lens type of each magnification, with the ideal H."""
-    before = predict_scene(scene, rays=False)
-    candidates: list[DesignCandidate] = []
-    for index, magnification in enumerate(magnifications):
-        try:
-            wider = with_lens(scene, magnification)
-            check_detail(scene, wider)
-            candidates.append(DesignCandidate(str(magnification), predict_scene(wider, rays=False)))
-        except InputError as error:
-            reason = str(error).removeprefix(f"{scene.source}: ")
-            candidates.append(DesignCandidate(str(magnification), None, reason))
-        progress((index + 1) / len(magnifications))
-    candidates.sort(key=lambda candidate: np.inf if candidate.expected is None else candidate.expected.mse)
-    return DesignComparison(before, candidates)
-
-
 def prove_best_camera(
-    scene: Scene, wanted: Sequence[LensCandidate], folder: Path | None, figures: FigureFiles, progress: Progress
+    scene: Scene, folder: Path | None, figures: FigureFiles, progress: Progress
 ) -> tuple[dict[str, Any], Rows]:
-    """Choose the best camera of some lens types, and return the proof in JSON's types and as rows of a table.
+    """Choose the best camera of the lens types of [design]; return the proof in JSON's types and as rows of a table.
 
     folder : of the scene files of the best cameras, the front and its figure, None to write none
     Raises InputError where no bound is known, or an error is out of reach.
     """
     table = scene.design or DesignTable()
+    wanted = candidates(scene, magnifications(table.magnifications))
     spaces = {bits: design_space(_with_bits(scene, bits), wanted) for bits in table.bits or (None,)}
     found, wishes, missed = dict[int | None, BestCamera](), dict[int | None, tuple[str, str]](), Rows()
     for bits, space in spaces.items():

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from ommatid.analysis import depth_error, predict, prediction_table, study, summary
 from ommatid.analysis.summary import Section
+from ommatid.batch.batch import Member
 from ommatid.reconstruct.output import facts
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.prediction import Prediction
+from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.runtime.printable import printable
 from ommatid.scenes.scene import Scene
 from ommatid.simulate import world_view
+
+from .batches import BatchOutcome
 
 
 def run_sections(folder: Path, description: dict[str, Any]) -> list[Section]:
@@ -34,9 +38,37 @@ def scene_sections(description: dict[str, Any]) -> list[Section]:
     return [geometry, *worlds, lenses, *_light_sections(description), *others]
 
 
-def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, Any] | None) -> list[Section]:
+def predicted_sections(members: Sequence[Member], outcome: BatchOutcome, detail: str | None) -> list[Section]:
+    """Tabulate predictions: that of one scene, several beside each other, or a sweep; for `detail` "table" each.
+
+    Scenes that failed are left out.
+    """
+    pairs = [pair for pair in zip(members, outcome.documents, strict=True) if "error" not in pair[1]]
+    if detail == "table" or len(members) == 1:
+        each = [section for member, document in pairs for section in _prediction_sections(member.content, document)]
+        return [*each, *outcome.sections]
+    if detail == "verdict" or outcome.sections or not pairs:
+        return outcome.sections if detail == "summary" else []
+    names = [Path(document["scene"]).stem for _, document in pairs]
+    predictions = [prediction_table.prediction_of(document) for _, document in pairs]
+    return [("Expected errors (Eq. 5)", [("scene", *names), *prediction_table.compared(predictions)])]
+
+
+def predicted_lines(documents: Iterable[dict[str, Any]]) -> list[str]:
+    """Return a line for each prediction: the scene, its swept values, and the expected error."""
+    lines: list[str] = []
+    for document in documents:
+        if "error" not in document:
+            values = "".join(f", {key} = {value}" for key, value in document.get("values", {}).items())
+            error = error_words(document["mse"], prediction_table.DIGITS)
+            lines.append(f"{Path(document['scene']).stem}{values}: expected squared error {error}")
+    return lines
+
+
+def _prediction_sections(scene: Scene, document: dict[str, Any]) -> list[Section]:
     """Tabulate a prediction, and the electrons that the pixels collect where the scene has a sensor."""
-    lines, tolerance = prediction_table.rows(prediction), scene.camera.tolerance
+    prediction, tolerance = prediction_table.prediction_of(document), scene.camera.tolerance
+    lines = prediction_table.rows(prediction)
     if (
         any(sentence.startswith(predict.LEFT_OUT) for sentence in prediction.assumes)
         and tolerance is not None
@@ -44,7 +76,7 @@ def prediction_sections(scene: Scene, prediction: Prediction, light: dict[str, A
         and scene.estimator.misalignment == "trust"
     ):
         lines.append(("misalignment", "not included; it is predicted for small targets and sharp lenses only"))
-    return [(printable(scene.title or scene.source.stem), lines), *_light_sections({"light": light} if light else {})]
+    return [(printable(scene.title or scene.source.stem), lines), *_light_sections(document)]
 
 
 def backend_sections(description: dict[str, Any]) -> list[Section]:

@@ -95,18 +95,22 @@ def with_figures(stages: Stages, figures: FigureFiles) -> Stages:
 def _and_figures(
     stages: Stages, figures: FigureFiles, setup: Setup, folder: Path, observer: RunObserver
 ) -> dict[str, Any]:
+    description = stages(setup, folder, observer)
+    write_figures(folder, figures)
+    return description
+
+
+def write_figures(folder: Path, figures: FigureFiles) -> None:
+    """Write the figures of a finished run in these files. Raises InputError or MachineError."""
     from ommatid.analysis.depth_error import PICTURE, draw
     from ommatid.reconstruct.output.overview import write_overview
     from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
-    from ommatid.scenes import stack
+    from ommatid.scenes import stack as stack_file
 
-    description = stages(setup, folder, observer)
-    report = run_json.read(folder)
-    channels = read_estimate(folder / ESTIMATE).channels
-    write_overview(folder, stack.read(folder / "stack.exr"), channels, report, figures)
+    report, stack = run_json.read(folder), stack_file.read(folder / "stack.exr")
+    write_overview(folder, stack, read_estimate(folder / ESTIMATE).channels, report, figures)
     if report.depth:
-        draw(folder / PICTURE, setup.camera, report.depth, files=figures)
-    return description
+        draw(folder / PICTURE, stack.camera, report.depth, files=figures)
 
 
 def check_run(setup: Setup, folder: Path) -> None:
@@ -202,13 +206,14 @@ def render(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
 
 
 def predict_scene(setup: Setup, folder: Path, observer: RunObserver, rays: bool = True) -> dict[str, Any]:
-    """Predict the error of a scene of a sweep, without rendering or writing anything."""
-    from ommatid.analysis.predict import predict_scene
+    """Predict the error of a scene and its electrons, without rendering or writing anything."""
+    from ommatid.analysis.predict import electrons, predict_scene
     from ommatid.analysis.prediction_table import json_of
 
     del folder, observer
     with naming_source(setup.scene.source):
-        return json_of(predict_scene(setup.scene, rays))
+        prediction, light = predict_scene(setup.scene, rays), electrons(setup)
+    return {**json_of(prediction), **({} if light is None else {"light": light})}
 
 
 def calibrated_model(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:

@@ -23,7 +23,6 @@ from ommatid.runtime.input_files import read_text
 from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables import toml
-from ommatid.scenes.tables.units import DURATION
 
 from . import stages
 from .stages import StageResults, finish, write_page
@@ -42,26 +41,20 @@ Curves = tuple[ErrorCurve, ErrorCurve]
 
 
 def stages_within(
-    time: str,
+    seconds: float,
     members: Sequence[Member],
     started: float,
     say: Callable[[str], None],
     scheduler: str = "",
     workers: int | None = None,
-) -> tuple[Stages, int | None]:
-    """Choose the stages of `run` and the number of processes for scenes that have a `time` together, such as "30 s".
+) -> Stages:
+    """Choose the stages of `run` for scenes that have a time together, and run one after the other in this process.
 
-    Without a time these are the ordinary stages and `workers`. Raises InputError if `time` is no duration, or if
-    `scheduler` or `workers` are given with it.
+    Raises InputError if `scheduler` or `workers` are given.
     """
-    if not time:
-        return stages.run, workers
     if scheduler or workers is not None:
         raise InputError("--within divides the time of this machine's one process; leave out --scheduler and --workers")
-    try:
-        return shared_time(DURATION.read(time), [member.folder for member in members], started, say), 1
-    except ValueError as error:
-        raise InputError(f"--within: {error}") from error
+    return shared_time(seconds, [member.folder for member in members], started, say)
 
 
 def check_within(setup: Setup, folder: Path) -> None:

@@ -175,14 +175,13 @@ REFUSED: dict[str, tuple[str, ...]] = {
     "the least is": ("--set", "design.error=1e-9", "--set", 'design.magnifications="1/3,1/4"'),
     "design.goal is 'information'": ("--set", "design.error=1", "--set", "design.goal=information"),
     "the smallest array takes": ("--set", "design.readings=0.1"),
-    "leave it out, or -o": ("--candidates", "1/2", "-o", "x"),
     "at most 200 lens types": (
         "--set",
         f"design.fill_factors={[f'1/{n}' for n in range(2, 21)]}".replace("'", '"'),
         "--set",
-        'design.magnifications="1/2,1/3,...,1/20"',
+        'design.magnifications="1/2,...,1/20"',
     ),
-    "design.magnifications: expected magnifications": ("--set", 'design.magnifications="3"'),
+    "design.magnifications: expected a magnification": ("--set", 'design.magnifications="3"'),
 }
 
 

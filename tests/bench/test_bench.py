@@ -296,7 +296,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("few")
 def test_the_command_writes_its_table_and_repeats_nothing(ommatid: Command, here: Path) -> None:
-    ended = ommatid("bench", "tiny.toml", "-o", "out", "--seconds", "3600", "--json")
+    ended = ommatid("bench", "tiny.toml", "-o", "out", "--within", "1 h", "--json")
     assert ended.code == 0, ended.err
     table = read(here / "out" / JSON)
     check(table, json.loads(ended.out))

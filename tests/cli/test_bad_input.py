@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ommatid.cli.failures import WITHDRAWN
+from ommatid.cli.failures import WITHDRAWN, WITHDRAWN_COMMANDS
 from ommatid.scenes import stack
 
 from ..conftest import TINY, Command, Ended, shell
@@ -216,6 +216,8 @@ def test_a_withdrawn_option_names_what_replaces_it(here: Path, ommatid: Command)
     for option, replacement in WITHDRAWN.items():
         for given in ((option, "x"), (f"{option}=x",)):
             assert_refused(ommatid(*RUN, *given), f"{option}: this option is withdrawn; {replacement}")
+    for command, replacement in WITHDRAWN_COMMANDS.items():
+        assert_refused(ommatid(command, "model.npz"), f"{command}: this command is withdrawn; {replacement}")
     assert [path.name for path in here.iterdir()] == ["tiny.toml"]
 
 

@@ -34,21 +34,21 @@ def numeric() -> dict[str, Any]:
 
 def test_numbers_of_options_have_bounds() -> None:
     options_with_numbers = numeric()
-    assert {"workers", "seconds", "figure_resolution", "seed", *UNBOUNDED} <= options_with_numbers.keys()
+    assert {"workers", "seed", *UNBOUNDED} <= options_with_numbers.keys()
     for name, option in options_with_numbers.items():
         assert None not in (option.min, option.max) or name in UNBOUNDED, name
 
 
 def test_extreme_numbers_are_refused(here: Path, ommatid: Command) -> None:
     for seconds in ("inf", "nan", "-1", "", "9" * 5000):
-        ended = ommatid("bench", here / "tiny.toml", "--seconds", seconds)
+        ended = ommatid("bench", here / "tiny.toml", "--within", f"{seconds} s")
         assert (ended.code, ended.out) == (2, "")
     for value in (0.0, -1.0, 1e13, float("inf"), float("nan")):
         with pytest.raises(InputError, match="expected a value above 0"):
             options.positive("--flat-value", value)
     for number in (str(2**63), "9" * 5000, "-" + "9" * 30, "1e5", "inf", "", "\0"):
         for read, text in (
-            (lambda text: options.acquisition(None, None, 1.0, text, None), f"{number},1"),
+            (lambda text: options.Frames(origin=text).settings, f"{number},1"),
             (lambda text: options.regions([text]), f"0,0,{number},1"),
             (lambda text: job_numbers(text, {}), f"1/{number}"),
             (lambda text: job_numbers("/4", {"PBS_ARRAY_INDEX": text}), number or "x"),

@@ -38,7 +38,7 @@ COARSE = {"I": "1", "II": "3/4", "III": "3/5"}
 
 def test_show_prints_the_terms_and_warns_of_what_is_left_out(phone: str, ommatid: Command) -> None:
     """2.44 * 550 nm * 2.008 mm / 0.5 mm = 5.39 um, 3.48 pixels; the pixels' area is 706 * (1.55 um)^2."""
-    ended = ommatid("show", phone)
+    ended = ommatid("show", phone, "-v")
     words = " ".join(ended.out.replace("│", " ").split())
     for expected in ("on the sensor 1/249", "focal length, mm 2 ", "field of view, ° ", "total track 2.008 mm"):
         assert expected in words

@@ -130,7 +130,7 @@ def test_the_estimate_is_written_in_other_formats(kept: Path, ommatid: Command) 
     np.testing.assert_array_equal(tifffile.imread(kept / "estimate.tiff"), estimate)
 
 
-@pytest.mark.parametrize(("names", "words"), [("png", "npy, tiff16, tiff32"), ("tiff16,tiff32", "one file")])
+@pytest.mark.parametrize(("names", "words"), [("gif", "npy, tiff16, tiff32"), ("tiff16,tiff32", "one file")])
 def test_unknown_formats_are_refused(names: str, words: str, here: Path, ommatid: Command) -> None:
     ended = ommatid(*RUN, "--format", names)
     assert (ended.code, (here / "out").exists()) == (2, False)
@@ -182,3 +182,38 @@ def test_files_named_by_set_are_relative_to_the_current_folder(here: Path, ommat
     lit = read(Path(scene), ["light.spectrum=led.csv"]).light
     assert lit is not None
     assert not isinstance(lit.spectrum, str)
+
+
+# --- how much is printed, and progress
+
+
+def test_several_scenes_are_compared_and_swept_by_dots_and_for_every_lens_type(
+    ommatid: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = ommatid("predict", "tile19", "single", "--no-rays")
+    rows = {cells[0]: cells[1:] for cells in (line.strip("│ ").split("│") for line in both.out.splitlines())}
+    rows = {name.strip(): [cell.strip() for cell in cells] for name, cells in rows.items()}
+    alone = [document(ommatid("predict", name, "--no-rays", "--json"))[0] for name in ("tile19", "single")]
+    assert rows["scene"] == ["tile19", "single"]
+    assert rows["squared error (MSE)"] == [f"{each['mse']:.6g}" for each in alone]
+    assert rows["measurements"] == [str(each["measurements"]) for each in alone]
+    sweep = ("predict", "tile19", "--no-rays", "--sweep", "noise.bits=8,...,10", "-q")
+    assert [line.partition(":")[0] for line in ommatid(*sweep).out.splitlines()] == [
+        f"tile19, noise.bits = {bits}" for bits in (8, 9, 10)
+    ]
+    small = ("predict", "tile19", "--no-rays", "--set", "camera.lens.*.pixels=[2,2]", "--json")
+    assert document(ommatid(*small))[0]["measurements"] == 50 * 4
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as a terminal
+    shown, quiet = ommatid(*sweep[:-1]), ommatid(*sweep)
+    assert "3 scenes" in shown.err
+    assert "3 scenes" not in shown.out
+    assert quiet.err == ""
+
+
+def test_show_is_one_short_table_and_all_with_v(ommatid: Command) -> None:
+    short, long, line = (ommatid("show", "sensor", *options).out for options in ((), ("-v",), ("-q",)))
+    assert len(short.splitlines()) <= 24
+    assert "left out: light through neighbouring lenses, interreflection" in short
+    assert "What will run" in long
+    assert line.splitlines() == short.splitlines()[:2]
+    assert "expected one of them" in ommatid("show", "sensor", "-v", "-q").err

@@ -73,7 +73,7 @@ def test_a_hostile_title_is_printed_harmlessly(ommatid: Command) -> None:
         ("show", "titled.toml", "--json"),
         ("predict", "titled.toml", "--no-rays"),
         ("predict", "titled.toml", "--no-rays", "--sweep", f"title={file_name(2)},={file_name(3)}", "-o", "swept"),
-        ("design", "titled.toml", "--lens", "I", "--candidates", "1/2"),
+        ("design", "titled.toml"),
         ("run", "titled.toml", "--dry-run"),
         ("run", "titled.toml", "--dry-run", "--sweep", "title=\x1b[31m,\u202e"),
         ("calibrate", "titled.toml", "-o", "\x1b[31m.npz", *QUICK),
@@ -86,7 +86,7 @@ def test_hostile_arguments_are_refused_harmlessly(here: Path, ommatid: Command) 
     text = hostile(0).replace("\x00", "")
     name = file_name(0)
     for arguments in (
-        *((option, text) for option in ("--set", "--lens", "--format", "--within", "--job", "--figure-format")),
+        *((option, text) for option in ("--set", "--lens", "--format", "--within", "--job")),
         *(("--set", f"{key}={text}") for key in ("target.image", "noise.variance", "camera.lens.I.name", text[:20])),
         *(("--scheduler", text), ("--sweep", text), ("--workers", text), (f"--{text}",)),
     ):
@@ -125,7 +125,7 @@ def elements(path: Path) -> Elements:
 
 @pytest.mark.slow
 def test_a_hostile_title_adds_nothing_to_pages_and_figures(scene: Path, finished: Path, ommatid: Command) -> None:
-    check(ommatid("run", scene.name, "-o", "out", "--figure-format", "svg"), 0)
+    check(ommatid("run", scene.name, "-o", "out", "--format", "svg"), 0)
     check(ommatid("run", scene.name, "-o", "out", "-v"), 0)
     folder = scene.parent / "out" / "titled"
     page, plain = elements(folder / "report.html"), elements(finished / "report.html")

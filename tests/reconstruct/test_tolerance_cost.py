@@ -93,8 +93,7 @@ def test_predict_includes_the_cost(ommatid: Command) -> None:
 def test_predict_with_saturated_pixels_and_with_blurred_lenses(ommatid: Command) -> None:
     """Saturated pixels are left out of both; a cost without closed form is reported as missing."""
     loose = ("--set", 'camera.tolerance.position="10 nm"')
-    aperture = [part for name in ["I", "II", "III"] for part in ("--set", f'camera.lens.{name}.aperture="0.4 mm"')]
-    aperture += ["--set", 'camera.wavelength="none"']
+    aperture = ["--set", "camera.lens.*.aperture=0.4 mm", "--set", "camera.wavelength=none"]
     sensor = ("--set", "noise=", "--set", 'sensor.illuminance="500 lux"', "--set", 'sensor.exposure="10 ms"')
     (bright,) = document(ommatid("predict", "--no-rays", GALLERY / "tile19.toml", *aperture, *sensor, *loose, "--json"))
     assert bright["measurements"] < 706
@@ -104,5 +103,3 @@ def test_predict_with_saturated_pixels_and_with_blurred_lenses(ommatid: Command)
     assert lens.code == 0
     assert "not included" in lens.out
     assert "not included" not in ommatid("predict", "--no-rays", GALLERY / "tile19.toml", *loose).out
-    ranked = document(ommatid("design", GALLERY / "tile19.toml", *aperture, *sensor, "--candidates", "1/2", "--json"))
-    assert ranked["candidates"][0]["expected"] is not None, "the added type has the aperture of the others"

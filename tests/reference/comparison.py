@@ -98,7 +98,7 @@ def read(result: Path, matrix: Path) -> Content:
 
 
 def stated_variance(model: Path, shape: tuple[int, int]) -> Any:
-    """Variances of the entries of H that a model file holds: `export-model` writes H alone."""
+    """Variances of the entries of H that a model file holds: `export` writes H alone."""
     with np.load(model) as arrays:
         if "data" not in arrays:  # few numbers, or nothing: their entries have no variances of their own
             return sparse.csr_array(shape)

@@ -72,8 +72,6 @@ def test_init_copies_a_scene_of_the_gallery_with_its_files(ommatid: Command) -> 
     for arguments, words in (
         (("copy/third.toml", "--from", "corridor"), "differs from the file of 'corridor'"),
         (("copy/third.toml", "--from", "tile18"), "expected a scene of the gallery, corridor"),
-        ((), "Usage"),
-        (("--json",), "expected the name of the scene file"),
     ):
         ended = ommatid("init", *arguments)
         assert ended.code == 2
@@ -87,10 +85,10 @@ def without_paths(file: Path) -> dict[str, Any]:
 
 
 def test_init_lists_the_gallery(ommatid: Command) -> None:
-    listed = ommatid("init", "--list").out.splitlines()
+    listed = ommatid("init").out.splitlines()
     assert [line.split()[0] for line in listed] == gallery_names()
     assert "The paper's 19 x 19 tile, three lens types" in next(line for line in listed if "tile19" in line)
-    assert [scene["name"] for scene in document(ommatid("init", "--list", "--json"))] == gallery_names()
+    assert [scene["name"] for scene in document(ommatid("init", "--json"))] == gallery_names()
 
 
 @pytest.mark.parametrize("command", ["run", "render", "predict", "show", "calibrate", "design", "bench", "export"])

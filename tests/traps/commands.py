@@ -21,7 +21,7 @@ RUN = ("results/tiny/stack.exr", "results/tiny/model.npz")
 COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "show": (("tiny.toml", "--figure", "figure.png"),),
     "predict": (("tiny.toml",), ("tiny.toml", "--set", "world.file=world.xml", "--set", "world.white=1")),
-    "design": (("tiny.toml", "--candidates", "1/2"),),
+    "design": (("tiny.toml",),),
     "run": (("tiny.toml", "-o", "results"), ("tiny.toml", "other.toml", "-o", "results", "--workers", "2")),
     "render": (("tiny.toml", "-o", "rendered"),),
     "calibrate": (("tiny.toml", "-o", "calibrated.npz"),),
@@ -29,14 +29,13 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "report": (("results",),),
     "check": (RUN,),
     "import": (("tiny.toml", "mosaic.npy", "-o", "imported.exr", "--origin", "0,0"),),
-    "export-model": ((RUN[1], "-o", "exported.npz"),),
-    "export": (("tiny.toml", "-o", "exported.xml"),),
+    "export": (("tiny.toml", "-o", "exported.xml"), (RUN[1], "-o", "exported.npz")),
     "init": (("mine.toml",),),
     "schema": ((),),
     "doctor": ((),),
 }
 SLOW: dict[str, tuple[tuple[str, ...], ...]] = {
-    "bench": (("tiny.toml", "-o", "results/bench", "--seconds", "1"),),
+    "bench": (("tiny.toml", "-o", "results/bench", "--within", "1 s"),),
     "paper": (("-o", "paper_results"),),
     "stability": (("-o", "stability_results"),),
 }

@@ -10,7 +10,7 @@ from typing import Any, Literal, cast, get_args
 import numpy as np
 
 from ommatid.runtime.arrays import Float32Array
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.formats import exr, npz, tiff
@@ -24,15 +24,17 @@ DESCRIPTIONS = {
 }
 
 
-def formats_of(text: str) -> tuple[Format, ...]:
-    """Read "npy,tiff16". Raises InputError for an unknown name, and for both kinds of TIFF, which are one file."""
-    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+def formats_of(names: Sequence[str]) -> tuple[Format, ...]:
+    """Check names of formats. Raises InputError for an unknown one, and for both kinds of TIFF, which are one file."""
     for name in names:
         if name not in get_args(Format):
-            raise InputError(f"--format {text}: expected names of {', '.join(get_args(Format))}, got '{name}'")
+            known = ", ".join(get_args(Format))
+            raise InputError(
+                f"--format: expected names of {known} (the estimate), svg, pdf (figures), got '{shortened(name)}'"
+            )
     if {"tiff16", "tiff32"} <= set(names):
-        raise InputError(f"--format {text}: tiff16 and tiff32 are one file, estimate.tiff; name one of them")
-    return cast(tuple[Format, ...], names)
+        raise InputError("--format: tiff16 and tiff32 are one file, estimate.tiff; name one of them")
+    return cast(tuple[Format, ...], tuple(names))
 
 
 def write_formats(estimate: Path, formats: Sequence[Format]) -> list[Path]:

@@ -45,7 +45,6 @@ def write_slide(
     names: Sequence[str] = (),
     crop: Region | None = None,
     dark: bool = False,
-    resolution: int = SLIDE,
 ) -> tuple[str, ...]:
     """Draw panels of the run in a folder into a file of the format of its suffix, and return their names.
 
@@ -70,7 +69,7 @@ def write_slide(
         check_region(*region, stack.camera.shape)
     names = chosen or tuple(name for name in PANELS if name in panels)
     figure = slide([_cropped(panels[name], region) for name in names], region, stack.camera.target_pitch, dark)
-    save_figure(figure, path, (kind,), resolution)
+    save_figure(figure, path, (kind,), SLIDE)
     return names
 
 

@@ -88,6 +88,7 @@ def check(data: dict[str, Any]) -> None:
             raise ValueError("a whole number does not fit into 64 bits")
 
 
+EVERY = "*"  # in place of the name of a lens type
 FILES = {  # first and last part of the keys that name files
     ("target", "image"),
     ("world", "file"),
@@ -101,8 +102,8 @@ FILES = {  # first and last part of the keys that name files
 def apply_overrides(data: dict[str, Any], overrides: Iterable[Change]) -> dict[str, Any]:
     """A copy with keys set, such as `noise.variance=1e-6` or `camera.lens.II.pixels=[2,2]`; an empty value removes one.
 
-    Values are read as by `value_of`; names of files are relative to the current folder. Raises InputError if a lens
-    type of a key does not exist.
+    `camera.lens.*.aperture=1 mm` sets that of every lens type. Values are read as by `value_of`; names of files are
+    relative to the current folder. Raises InputError if a lens type of a key does not exist.
     """
     changed = copy.deepcopy(data)
     for given in overrides:
@@ -111,15 +112,16 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[Change]) -> dict[s
         *tables, last = [part.strip() for part in key.split(".")]
         if len(tables) > DEEPEST:
             raise InputError(f"--set {override}: its key goes deeper than {DEEPEST} tables")
-        table: Any = changed
+        found: list[Any] = [changed]
         for name in tables:
-            table = _inside(table, name, override)
-        if not isinstance(table, dict):
-            raise InputError(f"--set {override}: '{'.'.join(tables)}' is not a table, so it has no key '{last}'")
-        if value is None:
-            table.pop(last, None)  # pyright: ignore[reportUnknownMemberType]
-        else:
-            table[last] = _from_here([*tables, last], value)
+            found = [inner for table in found for inner in _inside(table, name, override)]
+        for table in found:
+            if not isinstance(table, dict):
+                raise InputError(f"--set {override}: '{'.'.join(tables)}' is not a table, so it has no key '{last}'")
+            if value is None:
+                table.pop(last, None)  # pyright: ignore[reportUnknownMemberType]
+            else:
+                table[last] = _from_here([*tables, last], value)
     return changed
 
 
@@ -163,16 +165,19 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"expected one of TOML's types, got {type(value)}")
 
 
-def _inside(table: Any, name: str, override: str) -> Any:
+def _inside(table: Any, name: str, override: str) -> list[Any]:
+    """Return the tables that a part of a key names: one, or for `*` those of all lens types."""
     if isinstance(table, list):
         lenses = _by_name(table)  # pyright: ignore[reportUnknownArgumentType]
+        if name == EVERY:
+            return list(lenses.values())
         if name not in lenses:
             known = named(lenses, "'")
             raise InputError(f"--set {override}: no lens type is called '{name}'; there are {known}")
-        return lenses[name]
+        return [lenses[name]]
     if not isinstance(table, dict):
         raise InputError(f"--set {override}: '{name}' is not in a table")
-    return table.setdefault(name, {})  # type: ignore[return-value]
+    return [table.setdefault(name, {})]  # pyright: ignore[reportUnknownMemberType]
 
 
 def _from_here(key: list[str], value: Any) -> Any:

@@ -130,7 +130,8 @@ def _ratio(value: object) -> Fraction:
     return ratio
 
 
-def _magnification(value: object) -> Fraction:
+def magnification(value: object) -> Fraction:
+    """Read a magnification on the pixel grid. Raises ValueError."""
     ratio = _ratio(value)
     if not 0 < ratio <= 1:
         raise ValueError(f'expected a magnification above 0 and at most 1, such as "1/3", got {shortened_repr(value)}')
@@ -250,7 +251,7 @@ SignedAngle = Annotated[float, SIGNED_ANGLE]
 Illuminance = Annotated[
     float, Quantity("lux", "an illuminance", ("500 lux", "1 klux"), 'an illuminance, such as "500 lux"')
 ]
-Magnification = Annotated[Fraction, BeforeValidator(_magnification), PlainSerializer(_plain_ratio), _RATIO]
+Magnification = Annotated[Fraction, BeforeValidator(magnification), PlainSerializer(_plain_ratio), _RATIO]
 FillFactor = Annotated[tuple[Fraction, Fraction], BeforeValidator(_fill_factor), PlainSerializer(_plain_step), _STEP]
 Step = Annotated[tuple[Fraction, Fraction], BeforeValidator(_step), PlainSerializer(_plain_step), _STEP]
 Window = Annotated[

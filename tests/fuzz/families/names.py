@@ -34,8 +34,8 @@ OUTPUT_COMMANDS = (
     ),
     *(
         ("show", SCENE, "--figure", "{}.png"),
-        ("export-model", "sound.npz", "-o", "{}.npz"),
-        ("export-model", "sound.npz", "-o", "{}"),
+        ("export", "sound.npz", "-o", "{}.npz"),
+        ("export", "sound.npz", "-o", "{}"),
     ),
     ("reconstruct", "sound.exr", "sound.npz", "-o", "{}.exr"),
 )

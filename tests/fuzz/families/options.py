@@ -14,7 +14,7 @@ from ..family import RUN, SCENE, CommandCase, CommandFamily
 HARMLESS: dict[str, tuple[str, ...]] = {
     "show": (SCENE,),
     "predict": (SCENE, "--no-rays"),
-    "design": (SCENE, "--candidates", "1/2"),
+    "design": (SCENE, "--set", "design.magnifications=1/2,1/3"),
     "run": (SCENE, "-o", "out"),
     "render": (SCENE, "-o", "out"),
     "calibrate": (SCENE, "-o", "new.npz"),
@@ -22,14 +22,13 @@ HARMLESS: dict[str, tuple[str, ...]] = {
     "report": (RUN,),
     "check": ("sound.exr", "sound.npz"),
     "import": (SCENE, "mosaic.npy", "-o", "new.exr", "--origin", "0,0"),
-    "export-model": ("sound.npz", "-o", "new.npz"),
     "export": (SCENE, "-o", "new.xml"),
     "init": ("new.toml",),
     "schema": (),
 }
 SLOW = {"bench": (SCENE, "-o", "new"), "paper": ("-o", "new"), "stability": ("-o", "new"), "doctor": ()}
 WEIGHTS = {"run": 0.3, "render": 0.3, "calibrate": 0.5, "export": 0.5, "check": 0.5}  # of slow ones
-NOT_VALUES = ("nan", "inf", "-inf", "-1", "1e400", "x", "1,5", "", "0x10", "1e", "٣", "9" * 5000)  # for `--seconds`
+NOT_VALUES = ("nan", "inf", "-inf", "-1", "1e400", "x", "1,5", "", "0x10", "1e", "٣", "9" * 5000)  # for `--within`
 NUMBERS = (
     *("0", "-1", "1", "2", "-0.0", "1e308", "1e400", "-1e400", "inf", "-inf", "nan", "5e-324", "1e-400", "0x10", "1_0"),
     *("9223372036854775807", "9223372036854775808", "18446744073709551616", "9" * 400, "9" * 5000, "1" + "0" * 100),
@@ -132,7 +131,7 @@ def slow_case(rng: Random, folder: Path) -> CommandCase:
     name = rng.choice(sorted(SLOW))
     wrong: list[tuple[str, ...]] = [("--" + rng.choice(("x", "é", "\x1b[31m", "x" * 3000)),), ("too", "many", "words")]
     if name == "bench":
-        wrong += [("--seconds", rng.choice(NOT_VALUES)), ("--lens", "nope"), ("--set", "a=b")] * 2
+        wrong += [("--within", rng.choice(NOT_VALUES)), ("--lens", "nope"), ("--set", "a=b")] * 2
     if name == "paper":
         wrong += [
             ("--seed", rng.choice(("-1", "x", "1.5", "nan"))),
@@ -141,8 +140,7 @@ def slow_case(rng: Random, folder: Path) -> CommandCase:
     if name in ("paper", "stability", "bench"):
         wrong += [
             ("-o", f"{SCENE}/x"),
-            ("--figure-format", "exe"),
-            ("--figure-dpi", rng.choice(("0", "-1", "99999", "x"))),
+            ("--format", rng.choice(("exe", "npy"))),
         ]
     return CommandCase((name, *SLOW[name], *rng.choice(wrong)), refused=True)
 

@@ -23,7 +23,7 @@ INPUTS = {  # the file that is replaced, and commands that read it
         ("check", "in.exr", "sound.npz"),
         ("report", "in.exr"),
     ),
-    "in.npz": (("reconstruct", "sound.exr", "in.npz", "-o", "new.exr"), ("export-model", "in.npz", "-o", "new.npz")),
+    "in.npz": (("reconstruct", "sound.exr", "in.npz", "-o", "new.exr"), ("export", "in.npz", "-o", "new.npz")),
     "in.npy": (
         *(
             ("import", SCENE, "in.npy", "-o", "new.exr"),
@@ -67,7 +67,7 @@ OUTPUTS = {
         ("reconstruct", "sound.exr", "sound.npz", "-o", "new.exr"),
         ("import", SCENE, "mosaic.npy", "-o", "new.exr", "--origin", "0,0"),
     ),
-    "new.npz": (("calibrate", SCENE, "-o", "new.npz"), ("export-model", "sound.npz", "-o", "new.npz")),
+    "new.npz": (("calibrate", SCENE, "-o", "new.npz"), ("export", "sound.npz", "-o", "new.npz")),
     "new.xml": (("export", SCENE, "-o", "new.xml"),),
     "new.toml": (("init", "new.toml"),),
     "new.png": (("show", SCENE, "--figure", "new.png"),),

@@ -29,14 +29,14 @@ from .benchmarks import f_numbers
 from .conftest import Command, shell
 from .documentation import DOCS, PAGES, Block, blocks, page_name, text_of
 from .examples import GALLERY
-from .printed_figures import check_figures, is_printed, unchecked_decimals
+from .printed_figures import check_figures, is_printed, stated_figures, unchecked_decimals
 
 STARTER = str(GALLERY / "starter.toml")
 needs_fast_backend = pytest.mark.skipif(bool(unusable_reason("llvm_ad_mono")), reason="needs the fast backend")
 
 # Decimal numbers of these sections are no output of a command of the page. A section of `None`: all of a page.
 NOT_PRINTED: dict[tuple[str, str | None], str] = {
-    ("README.md", "Two commands"): "the version of Python",
+    ("README.md", "Install"): "the version of Python",
     ("docs/install.md", "Install"): "the version of Python",
     ("docs/install.md", "The fast backend"): "measured once on a machine with a graphics card",
     ("docs/speed.md", None): "times and ratios of `make bench`",
@@ -131,8 +131,15 @@ def test_steered_windows(ommatid: Command) -> None:
 
 def test_the_photograph_of_the_readme() -> None:
     camera = camera_of("photo")
-    check_figures("README.md", "it shows {} pixels reconstructed from fifty", camera.unknowns)
+    (seconds,) = stated_figures("speed.md", "| `photo` as it is | 239 | {} |")
+    figures = camera.unknowns, float(seconds)
+    check_figures("README.md", "{} pixels from fifty sub-imagers, reconstructed in {} seconds on two cores", *figures)
     assert len(camera.sub_imagers) == 50
+
+
+def test_three_types_against_one_in_the_readme() -> None:
+    errors = [predicted("tile19", "noise.variance=1e-2", lens=lens) for lens in ("", "I,I,I")]
+    check_figures("README.md", "squared error {}, not {}, with as many sensor pixels", *errors)
 
 
 def test_the_error_is_proportional_to_the_noise() -> None:
@@ -294,6 +301,23 @@ def test_the_first_camera(folder: Path) -> None:
 
 @pytest.mark.figures
 @needs_fast_backend
+def test_the_error_bars_of_the_readme(folder: Path) -> None:
+    scene = ommatid.read_scene("photo")
+    result = ommatid.run(scene, folder / "photo")
+    error = result.summary.error
+    assert error.mse is not None
+    assert error.expected_given_truth is not None
+    beyond = np.abs(result.image - ommatid.target_image(scene)) / result.deviation
+    shares = [100 * float(np.mean(beyond < limit)) for limit in (1, 2)]
+    check_figures("README.md", "RMS error {}, expected {};", error.mse**0.5, error.expected_given_truth.mse**0.5)
+    check_figures(
+        "README.md", "{} % of the pixels are off by less than their error bar, {} % by less than two", *shares
+    )
+    check_figures("README.md", "{} dB better than the best sub-image", error.gain or 0.0)
+
+
+@pytest.mark.figures
+@needs_fast_backend
 def test_a_prior_fitted_to_a_noisy_stack(folder: Path) -> None:
     independent = ran(folder, "tile35", "noise.variance=1").error.mse
     fitted = ran(folder, "tile35", "noise.variance=1", "prior.kind=fit").error.mse
@@ -381,6 +405,7 @@ def test_errors_by_rays_alone() -> None:
 # First lines of the text blocks that are no output of the command before them: formulas, files, other programs.
 NOT_OUTPUT = {
     "batches.md": ("ommatid reconstruct film/0*.exr", "openssl req", "dask scheduler", "#!/bin/sh"),
+    "README.md": ("pip install .",),
     "install.md": ("source .venv/bin/activate", "pip install ."),
     "lenses.md": ("# radius  thickness",),
     "coverage.md": ("python -m tests.benchmarks",),

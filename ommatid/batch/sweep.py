@@ -62,6 +62,8 @@ def sweep_axes(options: Iterable[str]) -> tuple[SweepAxis, ...]:
 
 
 def _values(text: str, option: str) -> tuple[str, ...]:
+    if re.search(r"\d\.\.+\d", text):
+        raise InputError(f"--sweep {shortened(option)}: dots stand between commas, as in noise.bits=8,...,12")
     try:
         return tuple(continued(_split(text)))
     except ValueError as error:

@@ -40,6 +40,11 @@ WITHDRAWN = {
 }
 WITHDRAWN_COMMANDS = {"export-model": "write `ommatid export model.npz -o H.npz`"}
 
+PHRASES = (  # of the library that reads numbers, and plain ones
+    (r"Input should be a valid (integer|number).*", r"expected a number, as in 4"),
+    (r"Input should be greater than or equal to ", "expected a number of at least "),
+    (r"Input should be less than or equal to ", "expected a number of at most "),
+)
 NOT_TRUSTED = 3  # exit code of --strict
 INTERRUPTED = 130  # exit code of a command stopped by Ctrl-C
 
@@ -116,14 +121,38 @@ def _parser_message(error: Any) -> str:
     option, message = getattr(error, "option_name", ""), str(error.format_message())
     if option in WITHDRAWN:
         return f"{option}: this option is withdrawn; {WITHDRAWN[option]}"
+    if option and message.startswith("No such option"):
+        return _unknown_option(option, message)
     match = re.match(r"No such command '(.*?)'\.", message, re.DOTALL)
     if match is None:
-        return message
+        return _plain(error, message)
     name = match[1]
     if name in WITHDRAWN_COMMANDS:
         return f"{name}: this command is withdrawn; {WITHDRAWN_COMMANDS[name]}"
     if name in gallery_names() or name.endswith(".toml"):
         return f"{shortened(name)}: expected a command before the scene, as in: ommatid run {shortened(name)}"
+    return message if "Did you mean" in message else f"{message} `ommatid -h` lists the commands"
+
+
+def _unknown_option(option: str, message: str) -> str:
+    """Return what an unknown option should be: one of two dashes, or a key of the scene."""
+    single = next((word for word in sys.argv if word.startswith(option) and len(word) > len(option)), "")
+    if len(option) == 2 and single:
+        return f"{shortened(single)}: no such option; long ones begin with two dashes, as in -{shortened(single)}"
+    from ommatid.scenes.scene import Scene
+    from ommatid.scenes.tables.messages import known_keys
+
+    name = option.lstrip("-").replace("-", "_")
+    keys = [key for key in known_keys(Scene) if key.rsplit(".", 1)[-1] == name]
+    return f"{option}: no such option; it is a key of the scene, as in --set {keys[0]}=VALUE" if keys else message
+
+
+def _plain(error: Any, message: str) -> str:
+    """Return a message of the parser in plain words, with where to read what is missing."""
+    if message.startswith("Missing"):
+        return f"{message.rstrip('.')}; `{error.ctx.command_path} -h` says what it is"
+    for phrase, words in PHRASES:
+        message = re.sub(phrase, words, message)
     return message
 
 

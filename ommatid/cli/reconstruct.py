@@ -15,6 +15,8 @@ from ommatid.runtime.printable import printable_sentence
 from . import failures, options, output
 from .options import Changes, FolderIfAny, Force, Formats, Json, Output, Printing, Processes, Strict
 
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")  # suffixes of recorded frames
+
 if TYPE_CHECKING:
     from ommatid.batch.frames import Frame, FrameOptions
     from ommatid.figures.saving import FigureFiles
@@ -87,6 +89,7 @@ def reconstruct(
 
     detail, (others, figures) = printing.detail, options.formats(formats)
     *stacks, model = files
+    _check_kinds(stacks, model)
     regions = tuple(options.region("--region", text) for text in region or ())
     common = FrameOptions(model, *changes.both, regions, others, force)
     if len(stacks) == 1:
@@ -96,6 +99,20 @@ def reconstruct(
         raise InputError("--scheduler: sends the tiles of one stack, got several stacks; take --workers instead")
     _check_no_figures(figures)
     _reconstruct_many(stacks, common, file, processes.workers, strict, detail)
+
+
+def _check_kinds(stacks: Sequence[Path], model: Path) -> None:
+    """Raise InputError where names say that files are of another kind, or in another order."""
+    for stack in stacks:
+        if stack.suffix == ".npz":
+            raise InputError(f"{stack}: expected a stack, an OpenEXR file, got a model; name the model last")
+        if stack.suffix.lower() in PICTURES:
+            raise InputError(
+                f"{stack}: expected a stack, an OpenEXR file, got a picture; make a stack of recorded frames by:"
+                f" ommatid import SCENE {stack} -o stack.exr"
+            )
+    if model.is_dir():
+        raise InputError(f"{model}: expected a model, got a folder; name its model.npz, or: ommatid report {model}")
 
 
 def _check_no_figures(figures: FigureFiles) -> None:
@@ -160,7 +177,8 @@ def _reconstruct_many(
     from ommatid.pipeline.reconstruction import finish_film
 
     if not stacks:
-        raise InputError(f"{common.model}: expected stacks and then their model, got one file; name a stack before it")
+        missing = "name a stack before it" if common.model.suffix == ".npz" else "name its model, model.npz, after it"
+        raise InputError(f"{common.model}: expected stacks and then their model, got one file; {missing}")
     check_index(folder)
     described: dict[Path, DescribedFrame] = {}
     with output.progress_bar("reconstruct", quiet=detail == "verdict") as progress:

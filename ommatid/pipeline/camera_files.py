@@ -11,7 +11,7 @@ import numpy as np
 
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.files import write_whole
-from ommatid.runtime.outputs.kinds import check_output
+from ommatid.runtime.outputs.kinds import check_output, check_suffix
 from ommatid.runtime.progress import Progress
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.hardware.frames import AcquisitionSettings, RecordedFrames, files_in, import_stack
@@ -38,6 +38,7 @@ def import_file(
     Raises InputError for a wrong scene or frame, MachineError for a full disk.
     """
     frames = (*images, *settings.dark, *settings.flat)
+    check_suffix(output, ".exr", "a stack")
     check_output(output, find_scene(path), *(file for frame in frames for file in files_in(frame)))
     setup = Setup.from_scene(read(path, changes))  # with all lens types, since all of them are on the sensor
     if lenses and not setup.camera.is_ideal_pinhole:
@@ -94,6 +95,7 @@ def calibrate_file(
     Returns the model, True if it had to be made, and warnings about the recorded frames.
     Raises InputError for a wrong scene, option or frame, MachineError for a full disk.
     """
+    check_suffix(output, ".npz", "a model")
     check_output(output, find_scene(path))
     setup = Setup.from_scene(read(path, changes, lenses))
     if recording is not None:
@@ -108,6 +110,7 @@ def export_matrix(model: Path, output: Path) -> dict[str, int]:
     """Write H of a model file as SciPy's sparse matrix, and return its size. Raises InputError or MachineError."""
     from scipy import sparse
 
+    check_suffix(output, ".npz", "a matrix")
     check_output(output, model)
     stored = model_file.read(model).to_sparse()
 

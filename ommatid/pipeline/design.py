@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from ommatid.analysis.design_report import FrontPoint, words_of
 from ommatid.analysis.predict import predict_scene
 from ommatid.figures.saving import FigureFiles
 from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.files import make_folder
 from ommatid.runtime.progress import Progress
 from ommatid.scenes.scene import Scene, with_tables, write
@@ -23,6 +25,7 @@ from ommatid.scenes.tables.estimation import DesignTable
 from ommatid.scenes.tables.sensor import NoiseTable
 
 Rows = list[tuple[str, str]]
+Item = TypeVar("Item")
 
 
 def prove_best_camera(
@@ -35,9 +38,11 @@ def prove_best_camera(
     """
     table = scene.design or DesignTable()
     wanted = candidates(scene, magnifications(table.magnifications))
-    spaces = {bits: design_space(_with_bits(scene, bits), wanted) for bits in table.bits or (None,)}
+    compared = table.bits or (None,)
+    step = _Steps(progress, len(compared) * (2 + (folder is not None) * (len(design_report.SHARES) + len(wanted))) + 3)
+    spaces = {bits: design_space(_with_bits(scene, bits), wanted) for bits in step(compared)}
     found, wishes, missed = dict[int | None, BestCamera](), dict[int | None, tuple[str, str]](), Rows()
-    for bits, space in spaces.items():
+    for bits, space in step(spaces.items()):
         if table.error is None:
             found[bits] = space.best(space.budget)
             continue
@@ -51,19 +56,20 @@ def prove_best_camera(
     chosen = min(found, key=lambda bits: _rank(found[bits], bits, table.error is not None))
     best = found[chosen]
     made, with_edges = list[Scene | None](), list[float | str]()
-    for number, each in enumerate(best.whole, 1):
+    for each in step(best.whole):
         try:
             made.append(None)
             made[-1] = camera = best.space.camera(each.counts)
             with_edges.append(predict_scene(camera, rays=scene.camera.tolerance is not None, picture=False).mse)
         except InputError as error:
             with_edges.append(str(error).removeprefix(f"{scene.source}: "))
-        progress(number / (len(best.whole) + (folder is not None)))
     lines = [wishes[chosen]] if chosen in wishes else []
     lines += design_report.rows(best, with_edges)
     lines += missed + [design_report.bits_row(bits, each) for bits, each in found.items() if bits is not None]
     if folder is not None:
-        points = [point for bits, each in found.items() for point in design_report.front(each.space, bits, each.budget)]
+        points = [
+            point for bits, each in found.items() for point in step(design_report.front(each.space, bits, each.budget))
+        ]
         make_folder(folder)
         files = dict[tuple[int | None, str], str]()
         for number, (each, camera) in enumerate(zip(best.whole, made, strict=True), 1):
@@ -72,8 +78,23 @@ def prove_best_camera(
                 write(folder / f"camera{number}.toml", camera)
         design_report.write_front(folder / "front.csv", points, [_file(folder, point, files) for point in points])
         design_report.draw_front(folder / "front.png", points, best, figures)
-        progress(1.0)
+    progress(1.0)
     return {"bits": chosen, **design_report.describe(best, with_edges)}, lines
+
+
+@dataclass
+class _Steps:
+    """Yields the items of several lists, and tells `progress` after each, of about `count` in all."""
+
+    progress: Progress
+    count: int
+    done: int = 0
+
+    def __call__(self, items: Iterable[Item]) -> Iterator[Item]:
+        for item in items:
+            yield item
+            self.done += 1
+            self.progress(min(self.done / self.count, 1.0))
 
 
 def steer_windows(
@@ -89,6 +110,8 @@ def steer_windows(
         row, column, rows, columns = (int(each) for each in region.groups())
         weights = steering.weights_of(scene, ((row, column), (rows, columns)))
     else:
+        if not Path(weighted).is_dir():
+            raise InputError(f"--steer {shortened(weighted)}: expected the folder of a run, or ROW,COLUMN,ROWS,COLUMNS")
         weights = read_estimate(Path(weighted) / ESTIMATE).channels["variance"].astype(np.float64)
     steered = steering.steer(scene, weights)
     if folder is not None:

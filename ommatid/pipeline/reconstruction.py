@@ -225,6 +225,8 @@ def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOu
     model or an estimate gets a page of these. Raises InputError if there is nothing to report.
     """
     if path.is_file():
+        if path.suffix.lower() != ".exr":
+            raise InputError(f"{path}: expected a folder of results, or a stack, which ends in .exr")
         in_run = path.name == STACK and output is None
         if not in_run and output is None:
             check_name(path.stem, path)

@@ -289,7 +289,12 @@ def read(path: Path, overrides: Iterable[Change] = (), lenses: Iterable[str] = (
     except FileNotFoundError as error:
         raise InputError(missing_scene(path)) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected a scene file in UTF-8, got other bytes at {error.start}") from error
+        raise InputError(
+            f"{path}: expected a scene file, a text in UTF-8, got other bytes at {error.start}; the scene stands before"
+            " other files"
+        ) from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path}: expected a scene file, got a folder; name the file in it") from error
     except OSError as error:
         raise InputError(f"{path}: could not be read as a scene file ({error.strerror})") from error
     try:

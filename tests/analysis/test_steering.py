@@ -101,7 +101,7 @@ def test_the_command_places_windows_for_a_region_and_for_a_run(here: Path, ommat
 
 REFUSED = {
     "inside the 19 x 19 pixels": (("--steer", "6,6,70,7"), ()),
-    "no such file": (("--steer", "nothing"), ()),
+    "expected the folder of a run": (("--steer", "nothing"), ()),
     "got no place for them": (("--steer", "1,1,2,2"), ("design.window=[9,9]",)),
     "cameras in their places": (("--steer", "1,1,2,2"), ('camera.tolerance={position="1 um"}',)),
     "without surfaces and distortion": (("--steer", "1,1,2,2"), ("camera.lens.I.distortion=[0.01,0]",)),

@@ -6,6 +6,7 @@ Damaged files and extreme values are those of tests/fuzz.
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,6 +108,7 @@ KEYS = [
     edited("[noise]", "[nois]", "unknown key 'nois'", "'noise'"),
     edited("[noise]", SECOND_LENS, "camera", "'I' twice"),
     edited("variance = 1e-2", "variance = ", "not valid TOML"),
+    edited('"6 um"', "6 um", "line 15, pixel_pitch = 6 um: ", "texts and quantities take quotation marks"),
 ]
 
 VALUES = [
@@ -180,6 +182,73 @@ OPTIONS = [
     Case("no folder for the model", ("calibrate", "tiny.toml", "-o", "no/new.npz"), ("no/new.npz", "does not exist")),
     Case("no folder for a new scene", ("init", "no/new.toml"), ("no/new.toml", "does not exist")),
 ]
+
+
+# What newcomers type: a command, and words of the sentence that leads to the cure.
+WRONG = {
+    # shapes, numbers and tables
+    "show tiny.toml --set target.shape=19": "target.shape: expected [rows, columns], two whole numbers of at least 1",
+    "show tiny.toml --set target.shape=[19]": "such as [19, 19], got [19]",
+    "show tiny.toml --set target.shape=19x19": "got '19x19'",
+    "show tiny.toml --set target.origin=96": "target.origin: expected [row, column]",
+    "show tiny.toml --set camera.lens.I.array=3": "camera.lens.I.array: expected [rows, columns]",
+    "show tiny.toml --set camera.lens.I.pixels=5": 'or "fit", got 5',
+    "show tiny.toml --set camera.lens=3": "expected a table [[camera.lens]] for each lens type",
+    "show tiny.toml --set noise=0.01": "noise: expected a table, whose keys are variance, bits, saturation",
+    "show tiny.toml --set noise.variance=1,5": "expected a number, got '1,5'; decimals take a point",
+    "show tiny.toml --set noise.variance=-1": "expected a number of at least 0",
+    "show tiny.toml --set noise.bits=8.5": "expected a whole number, got 8.5",
+    "show tiny.toml --set noise.bits=64": "expected a number of at most 24",
+    "show tiny.toml --set camera.walls=yes": "expected true or false, got 'yes'",
+    "show tiny.toml --set camera.lens.I.magnification=0.333": 'got 0.333: write "1/3" if that is meant, or "333/1000"',
+    "show tiny.toml --set camera.lens.I.magnification=1:3": 'expected a ratio such as "1/3"',
+    # units
+    "show tiny.toml --set camera.pixel_pitch=6": 'such as "6 um" or "6 mm", got the bare number 6',
+    "show tiny.toml --set camera.wavelength=550": 'such as "550 nm" or "550 mm"',
+    "show tiny.toml --set camera.pixel_pitch='6 pixels'": "expected a length with its unit",
+    "show tiny.toml --set camera.tolerance.rotation=1": "expected an angle with its unit",
+    # names of keys
+    "show tiny.toml --set camera.lens.I.magnifcation=1/3": "the nearest known key is 'camera.lens.magnification'",
+    "show tiny.toml --set camera.lens.I.focal=2mm": "the nearest known key is 'camera.lens.focal_length'",
+    "show tiny.toml --set noise.sigma=1": "the keys there are variance, bits, saturation",
+    "show tiny.toml --set prior.kind=gaussian": "expected 'independent', 'exponential', 'power' or 'fit'",
+    "show tiny.toml --set noise.variance:1": "expected KEY=VALUE",
+    # options and commands
+    "run tiny.toml --samples 100": "it is a key of the scene, as in --set render.samples=VALUE",
+    "run tiny.toml -set noise.variance=1": "long ones begin with two dashes, as in --set",
+    "run --dry-run": "Missing argument 'SCENE...'; `ommatid run -h` says what it is",
+    "run tiny.toml --workers two": "expected a number, as in 4",
+    "run tiny.toml --workers 0": "expected a number of at least 1",
+    "run tiny.toml --within 30": 'expected a time with its unit, such as "2 min"',
+    "run tiny.toml --sweep noise.variance=1e-4..1e-2": "dots stand between commas, as in noise.bits=8,...,12",
+    "run tiny.toml --format jpg": "expected names of npy, tiff16, tiff32 (the estimate), svg, pdf (figures), got 'jpg'",
+    "predict tiny.toml --format npy": "no estimate is written here",
+    "tile19": "expected a command before the scene, as in: ommatid run tile19",
+    "rnu tiny.toml": "Did you mean 'run'?",
+    "simulate tiny.toml": "`ommatid -h` lists the commands",
+    # files
+    "show tiny": "did you mean 'tiny.toml'?",
+    "show tile19.tml": "did you mean 'tile19'?",
+    "show out": "expected a scene file, got a folder",
+    "show out/tiny/stack.exr": "expected a scene file, a text in UTF-8",
+    "reconstruct out/tiny/model.npz out/tiny/stack.exr -o x": "got a model; name the model last",
+    "reconstruct out/tiny/stack.exr -o x": "name its model, model.npz, after it",
+    "reconstruct out/tiny/stack.exr out/tiny -o x": "got a folder; name its model.npz, or: ommatid report out/tiny",
+    "reconstruct photo.png out/tiny/model.npz -o x": "ommatid import SCENE photo.png -o stack.exr",
+    "import photo.png tiny.toml -o x.exr": "photo.png: no such scene file",
+    "import tiny.toml photo.png -o x.png": "expected the name of a stack, ending in .exr, such as x.exr",
+    "calibrate tiny.toml -o model.toml": "expected the name of a model, ending in .npz, such as model.npz",
+    "report tiny.toml": "expected a folder of results, or a stack, which ends in .exr",
+    "design tiny.toml --steer 1,2": "expected the folder of a run, or ROW,COLUMN,ROWS,COLUMNS",
+}
+
+
+@pytest.mark.usefixtures("kept")
+def test_what_newcomers_type_is_answered_by_a_sentence_that_leads_to_the_cure(here: Path, ommatid: Command) -> None:
+    before = contents(here)
+    for command, words in WRONG.items():
+        assert_refused(ommatid(*shlex.split(command)), words)
+    assert contents(here) == before
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -161,7 +161,7 @@ def test_the_root_and_its_transpose_pass_the_dot_test(prior: Prior) -> None:
         ({"correlation_length": "1 mm"}, "belongs to kind"),
         ({"kind": "exponential", "correlation_length": 3.0}, "bare number"),
         ({"kind": "exponential", "correlation_length": "1 mm", "exponent": 2.0}, "exponent belongs"),
-        ({"variance": 0.0}, "greater than 0"),
+        ({"variance": 0.0}, "above 0"),
         ({"kind": "gaussian"}, "'independent', 'exponential', 'power' or 'fit'"),
     ],
 )

@@ -256,7 +256,7 @@ def test_a_scene_takes_glasses_from_a_catalogue(tmp_path: Path) -> None:
     (tmp_path / "glass.agf").write_text(text, encoding="utf-8")
     for name, words in (
         ("N-BK8", r"surfaces\[1\].glass: expected a glass .*N-BK7.*nearest glass is 'N-BK7'"),
-        ("bad", "glass.agf, line 18, glass BAD: formula: expected less than or equal to 13"),
+        ("bad", "glass.agf, line 18, glass BAD: formula: expected a number of at most 13"),
     ):
         (tmp_path / "lens.zmx").write_text(LENS.format(unit="MM").replace("PMMA", name), encoding="utf-8")
         with pytest.raises(InputError, match=words.replace("less", "(?:less|.*)")):

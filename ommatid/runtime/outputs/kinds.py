@@ -57,6 +57,15 @@ def check_output(path: Path, *inputs: Path) -> None:
             raise InputError(f"{named}: would replace the file that is read; choose another name with -o")
 
 
+def check_suffix(path: Path, suffix: str, what: str) -> None:
+    """Raise InputError unless a file's name ends as those of its kind do, so that other programs know it."""
+    if path.suffix.lower() != suffix:
+        example = printable(path.with_suffix(suffix).name, SHORT) if path.name else f"x{suffix}"
+        raise InputError(
+            f"{printable(path, SHORT)}: expected the name of {what}, ending in {suffix}, such as {example}"
+        )
+
+
 def check_folder(path: Path) -> None:
     """Raise InputError if results could not be written into the folder `path`, or read there; it may be missing.
 

@@ -184,6 +184,8 @@ def _open(path: Path, header_only: bool = False) -> list[tuple[str, dict[str, ND
             )
             for part in _parts(path, header_only)
         ]
+    except InputError:
+        raise
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise InputError(
             f"{path}: expected an OpenEXR file, got one that cannot be read ({printable(error, longest=100)})"

@@ -186,7 +186,8 @@ def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
     if rows <= 0 or columns <= 0 or row + rows > picture.shape[0] or column + columns > picture.shape[1]:
         raise InputError(
             f"{scene.source}: target.origin: the crop of {max(rows, 0)} x {max(columns, 0)} pixels at"
-            f" [{row}, {column}] is empty or leaves the picture of {picture.shape[0]} x {picture.shape[1]} pixels"
+            f" [{row}, {column}] is empty or leaves the picture of {picture.shape[0]} x {picture.shape[1]} pixels;"
+            " correct it or target.shape"
         )
     return picture[row : row + rows, column : column + columns]
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
-
-from ommatid.runtime.errors import shortened_repr
 
 from ..geometry.quantities import FieldOfView, FNumber, SensorSize
 from ..optics.dispersion import Dispersion
@@ -24,6 +22,7 @@ from .units import (
     SignedAngle,
     Step,
     Window,
+    counts,
     file_name,
     pair,
 )
@@ -177,13 +176,7 @@ class LensTable(Table):
     @field_validator("pixels", mode="before")
     @classmethod
     def _check_pixels(cls, value: object) -> object:
-        numbers: list[object] = list(value) if isinstance(value, list | tuple) else []  # type: ignore[arg-type]
-        if value == "fit" or (len(numbers) == 2 and all(type(n) is int and n >= 1 for n in numbers)):  # type: ignore[operator]
-            return pair(cast(object, value))
-        raise ValueError(
-            'expected two whole numbers of at least 1, such as [5, 5], or "fit",'
-            f" got {shortened_repr(cast(object, value))}"
-        )
+        return value if value == "fit" else counts(value, also=', or "fit"')
 
     @field_validator("surfaces")
     @classmethod

@@ -31,8 +31,10 @@ def find_scene(path: Path) -> Path:
 def missing_scene(path: Path) -> str:
     """Explain that neither a file nor a gallery scene is called `path`, naming the nearest gallery scene, if any."""
     names = gallery_names()
-    nearest = get_close_matches(path.stem, names, 1)
-    hint = f"did you mean '{nearest[0]}'? The" if nearest else "the"
+    beside = {file.name: str(file) for file in path.parent.glob("*.toml")} if path.parent.is_dir() else {}
+    known = {f"{name}.toml": name for name in names} | beside
+    nearest = get_close_matches(path.name if path.suffix else f"{path.name}.toml", known, 1, 0.7)
+    hint = f"did you mean '{known[nearest[0]]}'? The" if nearest else "the"
     listed = f"{hint} gallery has {', '.join(names)}"
     return f"{path}: no such scene file; {listed}; `ommatid init {path.stem}.toml` writes a scene to start from"
 

@@ -9,11 +9,31 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from ommatid.runtime.errors import shortened_repr
+from ommatid.runtime.errors import named, shortened_repr
 from ommatid.runtime.printable import printable
 
 LONGEST = 100  # characters of a key that is compared with the known ones
-_SHOULD_HAVE = re.compile(r"^\w+ should have")  # of pydantic
+SHORTEST = 3  # characters of the beginning of a key
+# What was expected, by pydantic's type of a problem; names in braces are those of its context.
+EXPECTED = {
+    "tuple_type": "a list in brackets, such as [1, 2]",
+    "list_type": "a list in brackets, such as [1, 2]",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "bool_type": "true or false",
+    "string_type": "a text in quotation marks",
+    "finite_number": "a finite number",
+    "greater_than": "a number above {gt:g}",
+    "greater_than_equal": "a number of at least {ge:g}",
+    "less_than": "a number below {lt:g}",
+    "less_than_equal": "a number of at most {le:g}",
+    "too_long": "at most {max_length} values",
+    "too_short": "at least {min_length} values",
+    "literal_error": "{expected}",
+    "string_pattern_mismatch": "text that matches '{pattern}'",
+}
+DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
 DERIVED = {  # keys that may follow from others
     "magnification": ", or focal_length with target.distance and both pixel pitches",
     "pixels": ', or "fit", or field_of_view',
@@ -28,8 +48,13 @@ def explain(error: ValidationError, data: dict[str, Any], model: type[BaseModel]
     unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
     present = [problem for problem in problems if problem["type"] != "missing"]
     chosen = unknown or present or problems
-    sentence = _sentence(chosen[0], data, model)
-    others = len(chosen) - 1
+    of_key: dict[tuple[int | str, ...], ErrorDetails] = {}  # a union reports each of its branches: ours says more
+    for problem in chosen:
+        key = problem["loc"] if unknown else _keys_only(problem["loc"])
+        if key not in of_key or problem["type"] == "value_error":
+            of_key[key] = problem
+    sentence = _sentence(next(iter(of_key.values())), data, model)
+    others = len(of_key) - 1
     return sentence + (f" (and {others} more to correct)" if others else "")
 
 
@@ -54,24 +79,48 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
     location = problem["loc"] if error_type == "extra_forbidden" else _keys_only(problem["loc"])
     key = printable(_dotted(location, data), LONGEST)
     if error_type == "extra_forbidden":
-        keys = known_keys(model)
-        bare = ".".join(part for part in location if isinstance(part, str))[-LONGEST:]
-        near = difflib.get_close_matches(bare, keys, n=1, cutoff=0.5)
-        last = bare.rsplit(".", 1)[-1]
-        elsewhere = [known for known in keys if known.rsplit(".", 1)[-1] == last]
-        nearest = (elsewhere or near or difflib.get_close_matches(bare, keys, n=1, cutoff=0.0))[0]
-        return f"unknown key '{key}'; the nearest known key is '{nearest}'"
+        return f"unknown key '{key}'; {_nearest(location, known_keys(model))}"
     if error_type == "missing":
         from_others = DERIVED.get(key.rsplit(".", 1)[-1], "")
         return f"the key '{key}' is missing and has no default; add it{from_others}"
-    message = problem["msg"].removeprefix("Value error, ")
-    message = message.replace("Input should be", "expected").replace(
-        "String should match", "expected text that matches"
-    )
-    message = _SHOULD_HAVE.sub("expected", message).replace(" after validation", "")
+    message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
+    if error_type in EXPECTED:
+        message = f"expected {EXPECTED[error_type].format(**problem.get('ctx', {}))}"
+    if error_type in ("model_type", "dict_type"):
+        inside = [known.rsplit(".", 1)[-1] for known in _inside(_bare(location), known_keys(model))]
+        message = f"expected a table, whose keys are {named(inside)}"
+    if key == "camera.lens":
+        message = "expected a table [[camera.lens]] for each lens type"
     if "got" not in message:
         message = f"{message}, got {shortened_repr(problem['input'])}"
+    if isinstance(problem["input"], str) and DECIMAL_COMMA.fullmatch(problem["input"].strip()):
+        message += "; decimals take a point"
     return f"{key}: {message}" if key else message
+
+
+def _bare(location: tuple[int | str, ...]) -> str:
+    return ".".join(part for part in location if isinstance(part, str))[-LONGEST:]
+
+
+def _inside(table: str, keys: list[str]) -> list[str]:
+    """Return the keys of a table, not those of tables in it."""
+    before = f"{table}." if table else ""
+    return [key for key in keys if key.startswith(before) and "." not in key.removeprefix(before)]
+
+
+def _nearest(location: tuple[int | str, ...], keys: list[str]) -> str:
+    """Return the nearest known key in words: of the same name elsewhere, alike, or all of the same table."""
+    bare = _bare(location)
+    table, _, last = bare.rpartition(".")
+    elsewhere = [known for known in keys if known.rsplit(".", 1)[-1] == last]
+    beside = {known.rsplit(".", 1)[-1]: known for known in _inside(table, keys)}
+    near = [known for name, known in beside.items() if len(last) >= SHORTEST and name.startswith(last)]
+    near += [beside[name] for name in difflib.get_close_matches(last, beside, n=1, cutoff=0.5)]
+    found = elsewhere or near or difflib.get_close_matches(bare, keys, n=1, cutoff=0.8)
+    if found or not beside:
+        nearest = (found or difflib.get_close_matches(bare, keys, n=1, cutoff=0.0))[0]
+        return f"the nearest known key is '{nearest}'"
+    return f"the keys there are {named(beside)}"
 
 
 def _keys_only(location: tuple[int | str, ...]) -> tuple[int | str, ...]:

@@ -39,11 +39,23 @@ def loads(text: str) -> dict[str, Any]:
     except RecursionError as error:
         raise ValueError(f"its brackets go deeper than {DEEPEST} tables") from error
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(shortened(str(error))) from error
+        raise ValueError(_with_line(text, str(error))) from error
     except ValueError as error:  # from int() of too many digits
         raise ValueError("a number has thousands of digits") from error
     check(data)
     return data
+
+
+def _with_line(text: str, message: str) -> str:
+    """Return a message of the parser with the line that it is about, and what mostly is wrong there."""
+    place = re.search(r" \(at line (\d+), column \d+\)", message)
+    if place is None:
+        return shortened(message)
+    line = text.splitlines()[int(place[1]) - 1 : int(place[1])]
+    if not line or not line[0].strip():
+        return shortened(message)
+    reason = shortened(message.replace(place[0], ""))
+    return f"line {place[1]}, {shortened(line[0].strip())}: {reason}; texts and quantities take quotation marks"
 
 
 def _check_keys(text: str) -> None:

@@ -26,6 +26,7 @@ COMMON = re.compile(rf"\s*({NUMBER})\s*(\w+)\s*")
 QUANTITY = re.compile(rf"\s*{NUMBER}(\s*/\s*{NUMBER})?\s*\*?\s*{UNIT}(\s*[*/]\s*{UNIT})*\s*")
 RATIO = re.compile(rf"\s*{NUMBER}(/\d+)?\s*")
 EXTREME = 1e15  # largest quantity in mm, s, rad or lux, and inverse of the smallest: squares and ratios stay finite
+FEW = 100  # bare number from which a length may be meant in nm
 FACTORS = {  # of the commonest units, to the last bit as pint has them; pint takes half a second to load
     ("mm", "mm"): 1.0,
     ("um", "mm"): 0.001,
@@ -40,6 +41,7 @@ FACTORS = {  # of the commonest units, to the last bit as pint has them; pint ta
 }
 LONGEST_NAME, LONGEST_PATH = 255, 4000  # bytes that file systems accept
 LARGEST_VARIANCE = 1e24
+NOT_ROUNDED = Fraction(1, 40)  # magnification above which a decimal number may be a rounded 1/m
 FINEST_PART = 20  # of the side of a sensor pixel: exact areas of rotated pixels divide it
 FEWEST_SAMPLES, MOST_SAMPLES = 16, 2**24
 AUTO = "auto"  # samples: as many as needed
@@ -82,8 +84,9 @@ class Quantity:
         """Convert a text to a number of `unit`. Raises ValueError that says what was expected."""
         what, (first, second), got = self.what, self.examples, shortened_repr(value)
         if isinstance(value, float | int) and not isinstance(value, bool):
-            example = f"{value} {first.split()[1]}"
-            raise ValueError(f'expected {what} with its unit, such as "{example}", got the bare number {value}')
+            units = ["nm" if self.unit == "mm" and value >= FEW else second.split()[1], first.split()[1]]
+            examples = " or ".join(f'"{value} {unit}"' for unit in units)
+            raise ValueError(f"expected {what} with its unit, such as {examples}, got the bare number {value}")
         if not isinstance(value, str):
             raise ValueError(f'expected {what} with its unit, such as "{first}", got {got}')
         try:
@@ -135,6 +138,17 @@ def magnification(value: object) -> Fraction:
     ratio = _ratio(value)
     if not 0 < ratio <= 1:
         raise ValueError(f'expected a magnification above 0 and at most 1, such as "1/3", got {shortened_repr(value)}')
+    meant, digits = Fraction(1, round(1 / ratio)), len(str(value).partition(".")[2])
+    if (
+        "/" not in str(value)
+        and digits > 1
+        and ratio != meant
+        and ratio == round(meant, digits)
+        and ratio > NOT_ROUNDED
+    ):
+        raise ValueError(
+            f'expected an exact ratio, got {shortened_repr(value)}: write "{meant}" if that is meant, or "{ratio}"'
+        )
     return ratio
 
 
@@ -170,6 +184,22 @@ def _window(value: object) -> tuple[Fraction, Fraction]:
 def pair(value: object) -> object:
     """Convert a list of TOML to the tuple that frozen tables hold; return anything else unchanged."""
     return tuple(value) if isinstance(value, list) else value  # type: ignore[arg-type]
+
+
+def counts(value: object, also: str = "") -> object:
+    """Read [rows, columns]; also : words on what else would do. Raises ValueError that says what was expected."""
+    return _whole_pair(value, 1, f"[rows, columns], two whole numbers of at least 1, such as [19, 19]{also}")
+
+
+def _corner(value: object) -> object:
+    return _whole_pair(value, 0, "[row, column], two whole numbers of at least 0, such as [12, 8]")
+
+
+def _whole_pair(value: object, least: int, expected: str) -> object:
+    numbers = list(cast(Sequence[object], value)) if isinstance(value, list | tuple) else None
+    if numbers is None or len(numbers) != 2 or not all(type(each) is int and each >= least for each in numbers):
+        raise ValueError(f"expected {expected}, got {shortened_repr(value if numbers is None else numbers)}")
+    return pair(value)
 
 
 def _plain_ratios(ratios: tuple[Fraction, ...]) -> list[str | int]:
@@ -261,8 +291,8 @@ Window = Annotated[
     WithJsonSchema({"type": "array", "items": {"type": ["string", "number"]}, "minItems": 2, "maxItems": 2}),
 ]
 Count = Annotated[int, Field(ge=1)]
-Pair = Annotated[tuple[Count, Count], BeforeValidator(pair)]
-Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(pair)]
+Pair = Annotated[tuple[Count, Count], BeforeValidator(counts)]
+Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(_corner)]
 FileName = Annotated[str, AfterValidator(file_name)]
 Samples = Annotated[
     int | Literal["auto"],

@@ -62,7 +62,7 @@ def frame_system(
     seen, precision = observation or observed(camera), 1 / prior
     spectrum = np.broadcast_to(prior, camera.shape)
     bands = bands_of(camera, 1, spectrum, weights, seen)
-    return FrameSystem(seen, weights, precision, bands=bands, types=tuple(camera.type_slices()))
+    return FrameSystem(seen, weights, precision, bands, tuple(camera.type_slices()))
 
 
 def precision(matrix: sparse.csr_array, weights: FloatArray, prior: float) -> FloatArray:

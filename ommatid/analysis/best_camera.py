@@ -332,8 +332,6 @@ def _bands(scene: Scene, prior: PriorTable, types: Sequence[LensCandidate]) -> B
         shown = parse({**tables, "target": {**tables["target"], "shape": [side, side]}}, scene.source)
     task = _task(shown, prior, types)
     bands = frame_system(task).bands
-    if bands is None:
-        raise InputError(f"{scene.source}: the bound is that of lenses that see the same everywhere")
     if scene.sensor is None:
         return bands
     alone = [_weights(_task(scene, prior, [each]))[0] for each in types]

@@ -132,10 +132,8 @@ class Assumptions:
         unknown = self.of_rendering * result.expected.parts.get("rendering", 0.0)
         if result.interval is None or not unknown:
             return result
-        given, count = result.interval, result.image.size
-        return replace(
-            result, interval=given.with_added(0.0, (count * unknown) ** 2, count) if given.variance else given
-        )
+        count = result.image.size
+        return replace(result, interval=result.interval.with_added(0.0, (count * unknown) ** 2, count))
 
 
 def assumptions_at(

@@ -32,18 +32,6 @@ CHUNK = 512  # pixels solved for at once
 COVERAGE = (0.005, 0.995)  # quantiles of the interval
 
 
-def is_stiff(form: Form) -> bool:
-    """Return True if a posterior variance is so far below the prior's that solutions need refinement."""
-    prior = form.problem.prior.variance
-    return bool((form.variance() < STIFF * prior).any())
-
-
-def refined_solutions(form: Form, residuals: ExactResiduals, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Solve for c = `shift`, (K, q), and r = 0 with refinement: u, (K, q), and l, (M, q)."""
-    refined = refine(form, residuals, shift, exact(np.zeros((form.problem.measurements, shift.shape[1]))))
-    return refined.coefficients, refined.multipliers
-
-
 def variance_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray) -> float:
     """Return the expected squared error (Eq. 5) of a weighted sum of pixels; weights : (N,), such as 1/n in a region.
 
@@ -52,7 +40,7 @@ def variance_of_sum(form: Form, weights: FloatArray, noise_variance: FloatArray)
     """
     problem, residuals = form.problem, ExactResiduals(form.problem)
     shift = residuals.root_transposed(exact(weights[:, None]))
-    refined = refine(form, residuals, shift, exact(np.zeros((problem.measurements, 1))))
+    refined = refine(form, residuals, shift)
     prior, squares = float(np.square(refined.coefficients).sum()), np.square(refined.multipliers[:, 0])
     variance = prior + float(noise_variance @ squares)
     expected, bound = (float(values[0]) for values in exact_sums(form, residuals, shift))
@@ -90,8 +78,8 @@ def bias_of(form: Form, difference: FloatArray) -> FloatArray:
     rest = difference - prior.apply_root(deviation)
     if not np.isfinite(rest).all() or np.linalg.norm(rest) > np.linalg.norm(difference):
         deviation, rest = np.zeros(prior.dimension), difference
-    u, _ = refined_solutions(form, ExactResiduals(form.problem), deviation[:, None])
-    return prior.apply_root(u[:, 0]) + rest - form.gain(form.problem.matrix @ rest)
+    refined = refine(form, ExactResiduals(form.problem), exact(deviation[:, None]))
+    return prior.apply_root(refined.coefficients[:, 0]) + rest - form.gain(form.problem.matrix @ rest)
 
 
 @dataclass(frozen=True)
@@ -143,7 +131,7 @@ class ExpectedError:
 class Interval:
     """Expectation of the mean squared error given the image, and the interval that holds it in 99 of 100 cases.
 
-    variance : of the mean squared error, a gamma variate; 0 where it is certain, or where the interval is wider
+    variance : of the mean squared error, a gamma variate; 0 where it is certain
     """
 
     mse: float
@@ -227,12 +215,14 @@ def solved_columns(form: Form, pixels: Pixels) -> Iterator[tuple[slice, Pixels, 
 
     They are refined where posterior variances are so far below the prior's that rounding would hide them.
     """
-    residuals = ExactResiduals(form.problem) if is_stiff(form) else None
+    is_stiff = (form.variance() < STIFF * form.problem.prior.variance).any()
+    residuals = ExactResiduals(form.problem) if is_stiff else None
     for start in range(0, pixels.size, CHUNK):
         chunk = slice(start, min(start + CHUNK, pixels.size))
         chosen = pixels[chunk]
         if residuals is None:
             u, negative = form.pixel_solutions(chosen)
         else:
-            u, negative = refined_solutions(form, residuals, form.problem.pixel_shift(chosen))
+            refined = refine(form, residuals, exact(form.problem.pixel_shift(chosen)))
+            u, negative = refined.coefficients, refined.multipliers
         yield chunk, chosen, u, negative

@@ -12,7 +12,8 @@ from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene
 
 from .estimator.estimate import needed_memory
-from .frame.conjugate_gradients import band_width, band_work, leaves_null_space, serves
+from .frame.bands import leaves_null_space
+from .frame.conjugate_gradients import band_width, band_work, serves
 from .frame.frame_method import FrameMethod
 from .frame.reading_space import MOST_READINGS, MOST_UNKNOWNS
 from .frame.variance_map import LONG

@@ -91,6 +91,12 @@ class Prior:
         """Return L^T f: (N,) to (K,), or (N, q) to (K, q)."""
         return _scale_rows(self.root, image) if self.independent else self.root.T @ image
 
+    def variance_of(self, covariance: FloatArray) -> FloatArray:
+        """Return the variance of every pixel, (N,), from the covariance of u, (K, K)."""
+        if self.independent:
+            return self.variance * np.diagonal(covariance)
+        return np.einsum("ij,ij->i", self.root @ covariance, self.root)
+
     def scaled(self, ratio: float) -> Prior:
         """Return the prior with `ratio` times the covariance."""
         return self if ratio == 1 else Prior(self.mean, ratio**0.5 * self.root, self.rounding)

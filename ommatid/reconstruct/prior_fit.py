@@ -415,12 +415,8 @@ def fit_prior(task: EstimationTask, *, prior_known: bool = False, noise_known: b
             " give prior.kind and estimator.noise_variance"
         )
     if noise_known:
-        measured = _Measured.of(task, places, task.expected_noise, prior_known=prior_known)
-        fit = measured.fit(noise_known=True)
         overview = None if prior_known or len(places) == 1 else _PartMeans.of(task)
-        if overview is None or fit.prior is None or overview.excess(fit.prior) <= MOST_EXCESS:
-            return fit
-        return measured.beside(overview).fit(noise_known=True)
+        return _Measured.of(task, places, task.expected_noise, prior_known=prior_known).fit_beside(overview)
     # A multiple of the whole noise is fitted, whose distribution over the measurements is uniform at first.
     known = task.expected_noise
 
@@ -445,20 +441,18 @@ def fit_picture(picture: FloatArray, detail: int, pitch: float, table: PriorTabl
     windows = [
         _Picture(picture[down, across] - table.mean, table.level_deviation) for down, across in product(rows, columns)
     ]
-    spectra = _spectra(windows[0].image.shape, pitch, detail)
     if not any(window.image.any() for window in windows):
         return None
-
-    def fitted(evidence: list[list[Evidence]]) -> FittedPrior:
-        posteriors, shares, _, _ = _posteriors(evidence, spectra, prior_known=False, noise_known=True)
-        return _mean_prior(table, spectra, posteriors, shares)
-
-    evidence = _evidence(windows, spectra)
-    prior, side = fitted(evidence), detail * max(min(picture.shape) // detail // PARTS, 1)
-    if len(windows) == 1 or min(picture.shape) < FEWEST_PARTS * side:
-        return prior
-    overview = _PartMeans(means_over(picture, side) - table.mean, table.level_deviation, ROUNDING, side, pitch / detail)
-    return prior if overview.excess(prior) <= MOST_EXCESS else fitted(_with(evidence, overview, spectra))
+    spectra, side = (
+        _spectra(windows[0].image.shape, pitch, detail),
+        detail * max(min(picture.shape) // detail // PARTS, 1),
+    )
+    known, overview = np.full(1, ROUNDING), None
+    if len(windows) > 1 and min(picture.shape) >= FEWEST_PARTS * side:
+        means = means_over(picture, side) - table.mean
+        overview = _PartMeans(means, table.level_deviation, ROUNDING, side, pitch / detail)
+    measured = _Measured(table, known, known, picture.size, spectra, _evidence(windows, spectra), prior_known=False)
+    return measured.fit_beside(overview).prior
 
 
 def natural_prior(table: PriorTable, pitch: float) -> FittedPrior:
@@ -471,13 +465,15 @@ def natural_prior(table: PriorTable, pitch: float) -> FittedPrior:
 
 @dataclass(frozen=True)
 class _Measured:
-    """What windows of a task say of each spectrum.
+    """What windows of a task, or of a picture, say of each spectrum.
 
+    table : its mean and its level;  known : (measurements used,) noise, or the part of it that is known
     noise : (measurements used,), of which a multiple is fitted where it is not known
     spectra, evidence : for each of them the evidence of all windows;  prior_known : True for the task's own spectrum
     """
 
-    task: EstimationTask
+    table: PriorTable
+    known: FloatArray
     noise: FloatArray
     measurements: int
     spectra: list[NaturalSpectrum]
@@ -491,11 +487,17 @@ class _Measured:
         shape, pitch = places[0].shape, task.model.camera.target_pitch
         spectra = [_known(task, shape)] if prior_known else _spectra(shape, pitch, _detail(task))
         count = sum(place.numbers.size for place in places)
-        return cls(task, noise, count, spectra, _evidence(windows, spectra), prior_known)
+        known = task.expected_noise
+        return cls(task.prior, known, noise, count, spectra, _evidence(windows, spectra), prior_known)
 
-    def beside(self, means: _PartMeans) -> _Measured:
-        """Count means over parts of the image, too."""
-        return replace(self, evidence=_with(self.evidence, means, self.spectra))
+    def fit_beside(self, means: _PartMeans | None) -> PriorFit:
+        """Return the fit for known noise; means over parts of the image count where they vary by far more."""
+        fit = self.fit(noise_known=True)
+        if means is None or fit.prior is None or means.excess(fit.prior) <= MOST_EXCESS:
+            return fit
+        pairs = zip(self.evidence, self.spectra, strict=True)
+        evidence = [[*each, means.evidence(spectrum)] for each, spectrum in pairs]
+        return replace(self, evidence=evidence).fit(noise_known=True)
 
     def fit(self, *, noise_known: bool) -> PriorFit:
         """Return the fit of the prior, and of a multiple of the noise."""
@@ -504,13 +506,13 @@ class _Measured:
         )
         multiple = float(shares @ [each.means[1] for each in posteriors])
         # Known noise and a variance n have multiples of the whole whose mean is 1 + (n - the last n) mean(1 / noise).
-        last = float(self.noise[0] - self.task.expected_noise[0])
+        last = float(self.noise[0] - self.known[0])
         noise_variance = last + (multiple - 1) / float(np.mean(1 / self.noise))
         numbers = {} if self.prior_known else _numbers_of(self.spectra, posteriors, shares)
         if not noise_known:
             numbers["noise_variance"] = noise_variance, _moments(shares, [each.moments[1] for each in posteriors])[1]
         return PriorFit(
-            prior=None if self.prior_known else _mean_prior(self.task.prior, self.spectra, posteriors, shares),
+            prior=None if self.prior_known else _mean_prior(self.table, self.spectra, posteriors, shares),
             noise_variance=None if noise_known else max(noise_variance, 0.0),
             numbers=numbers,
             measurements=self.measurements,
@@ -522,11 +524,6 @@ class _Measured:
 def _evidence(windows: Sequence[Window | _Picture], spectra: list[NaturalSpectrum]) -> list[list[Evidence]]:
     """Return for every spectrum the evidence of all windows."""
     return [[window.evidence(spectrum) for window in windows] for spectrum in spectra]
-
-
-def _with(evidence: list[list[Evidence]], means: _PartMeans, spectra: list[NaturalSpectrum]) -> list[list[Evidence]]:
-    """Return for every spectrum the evidence of all windows and of means over parts."""
-    return [[*each, means.evidence(spectrum)] for each, spectrum in zip(evidence, spectra, strict=True)]
 
 
 def _posteriors(

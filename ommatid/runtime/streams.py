@@ -56,7 +56,6 @@ class Purpose(IntEnum):
     ERROR_MAP = 50  # of a frame
     ERROR_PARTS = 51
     ERROR_INTERVAL = 52
-    TILE_COST = 53
     PRECONDITIONER = 54  # trial of one
     RESIDUAL = 60
     CONTRAST = 61

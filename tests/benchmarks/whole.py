@@ -72,7 +72,6 @@ class Whole:
     def deviation(self) -> float:
         """Posterior standard deviation of a pixel far from the edges, by transfer functions."""
         bands = self.frame().bands
-        assert bands is not None
         return bands.variances(1.0, (1.0,) * len(bands.types))[0] ** 0.5
 
 

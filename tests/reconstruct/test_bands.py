@@ -75,7 +75,7 @@ def test_groups_of_waves_invert_the_precision_of_reflected_readings(
     camera: tuple[Bands, Array, list[Array]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bands, covariance, _ = camera
-    monkeypatch.setattr(Bands, "_strips", ())
+    monkeypatch.setattr(Bands, "_edges", {})
     monkeypatch.setattr(Bands, "_corners", [])
     image = np.random.default_rng(1).normal(size=bands.spectrum.shape)
     np.testing.assert_allclose(bands.solve(image).ravel(), covariance @ image.ravel(), atol=1e-12)
@@ -86,7 +86,7 @@ def test_even_and_odd_kernels_invert_the_precision_of_their_reflected_readings(
     side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On the grid of f, with middles on its pixels and between them."""
-    monkeypatch.setattr(Bands, "_strips", ())
+    monkeypatch.setattr(Bands, "_edges", {})
     monkeypatch.setattr(Bands, "_corners", [])
     rng = np.random.default_rng(side)
     spectrum, kernel = rng.random(SHAPE) + 0.1, rng.random((side, side))
@@ -191,7 +191,7 @@ def test_a_window_turns_the_map_of_mean_kernels_into_that_of_all(monkeypatch: py
         finer=1,
         precision_on=lambda _: 1 / spectrum,
         prior=SimpleNamespace(kind="exponential"),
-        model=SimpleNamespace(camera=CAMERA),
+        model=SimpleNamespace(camera=CAMERA, applied=varying, unknowns=CAMERA.unknowns),
         used=np.ones(CAMERA.measurements, dtype=np.bool_),
         among_used=lambda numbers: numbers,
         expected_noise=noise,

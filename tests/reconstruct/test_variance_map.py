@@ -11,9 +11,8 @@ import pytest
 from scipy import linalg
 
 from ommatid.reconstruct.frame.conjugate_gradients import FrameSystem
-from ommatid.reconstruct.frame.error_map import ExactVariances, check_map, error_map
+from ommatid.reconstruct.frame.error_map import ExactVariances, check_map, error_map, map_by_bands
 from ommatid.reconstruct.frame.swept import swept_maps
-from ommatid.reconstruct.frame.variance_map import frame_map
 from ommatid.reconstruct.frame.windows import Windows, by_windows, of_mean_kernels, windows_map
 from ommatid.reconstruct.methods.method import EstimationTask
 from ommatid.reconstruct.prior import reflecting_root
@@ -107,16 +106,11 @@ def test_actual_noise_that_differs_from_the_expected_one(case: str) -> None:
         [np.full(each.measurements, value) for each, value in zip(types, (1e-4, 1e-3, 1e-2), strict=True)]
     )
     system, matrix = system_of(task), task.model.to_sparse()
-    assert system.bands is not None
     if case == "sweep":
         maps = swept_maps(matrix, system.weights, noise / 1e-2, 1 / P0, shape, 5)
     else:
         make = windows_map(task, system.weights, system.bands, noise, 28) if case == "windows" else None
-        found = (
-            frame_map(task, system, system.bands, noise, "swept" if case == "strips" else "edges")
-            if make is None
-            else make
-        )
+        found = map_by_bands(task, system, noise, "swept" if case == "strips" else "edges") if make is None else make
         maps = np.array([found.posterior, found.missing, found.noisy])
     prior = np.eye(shape[0] * shape[1]) / P0
     if case in ("small frame", "windows"):
@@ -191,8 +185,7 @@ def test_kernels_that_vary_over_the_field() -> None:
     ]
     observation = replace(observation, parts=(*parts, *observation.parts[1:]))
     system = replace(system_of(task), observation=observation)
-    assert system.bands is not None
-    maps = frame_map(task, system, system.bands, task.expected_noise, "edges")
+    maps = map_by_bands(task, system, task.expected_noise, "edges")
     variance = by_windows(maps, task, observation, task.expected_noise, of_mean_kernels(observation)).posterior
     for place in ((0, 0), (41, 44), (41, 0), (82, 30), (20, 60), (60, 89), (5, 70), (70, 12)):
         unit = np.zeros(shape)
@@ -207,8 +200,7 @@ def test_some_windows_give_the_mean_error_of_another_camera(shape: tuple[int, in
     odd = (("1/3", [3, 2], "fit"), ("1/4", [4, 4], "fit"), ("1/5", [4, 5], "fit"))
     task = task_of(wide(shape, odd, **CORRELATED), 1.0)
     system = system_of(task)
-    assert system.bands is not None
-    like = frame_map(task, system, system.bands, task.expected_noise, "edges")
+    like = map_by_bands(task, system, task.expected_noise, "edges")
     found = by_windows(like, task, task.model.applied, task.expected_noise)
     every = windows_map(task, system.weights, system.bands, task.expected_noise, 8)
     assert found.variance.mean() == pytest.approx(every.variance.mean(), rel=0.02)
@@ -227,7 +219,6 @@ def test_windows_are_corrected_by_some_with_a_longer_halo(
     task = task_of(wide(shape, odd, **CORRELATED))
     task = replace(task, expected_noise=100 * uneven(task, decades))
     system = system_of(task)
-    assert system.bands is not None
     found = windows_map(task, system.weights, system.bands, task.expected_noise, halo).variance.reshape(shape)
     root = reflecting_root(np.asarray(1 / np.asarray(task.precision_on(shape))))
     exact = precision(task.model.to_sparse(), system.weights, 0.0) + linalg.inv(root @ root.T)

@@ -30,7 +30,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 
 from ..problem import Form
-from .residuals import DoubleDouble, ExactResiduals, as_exact, column_dots, exact
+from .residuals import DoubleDouble, ExactResiduals, column_dots, exact
 
 Indices = NDArray[np.intp]
 Residuals = tuple[FloatArray, FloatArray]
@@ -108,14 +108,19 @@ class RefinedSolution:
 
 
 def refine(
-    form: Form, residuals: ExactResiduals, shift: FloatArray | DoubleDouble, recorded: DoubleDouble
+    form: Form, residuals: ExactResiduals, shift: DoubleDouble, recorded: DoubleDouble | None = None
 ) -> RefinedSolution:
-    """Solve for c = `shift`, (K, q), and r = `recorded`, (M, q), with refinement; keep the solution of least bound."""
+    """Solve for c = `shift`, (K, q), and r = `recorded`, (M, q) or 0, with refinement; keep that of least bound."""
     with np.errstate(all="ignore"):  # overflow gives a bound that fails every tolerance
-        certifier = _Certifier(form, residuals, as_exact(shift), recorded)
+        certifier = _Certifier(form, residuals, shift, recorded or _no_data(form, shift))
         (u, multipliers), bound, first, steps = certifier.refined()
         change = relative(norms(u.high - first), norms(u.high))
     return RefinedSolution(u.high, u.low, multipliers.high, bound, change + bound, steps)
+
+
+def _no_data(form: Form, shift: DoubleDouble) -> DoubleDouble:
+    """Return r = 0, (M, q), for c = `shift`, (K, q)."""
+    return exact(np.zeros((form.problem.measurements, shift.high.shape[1])))
 
 
 def exact_sums(form: Form, residuals: ExactResiduals, shift: DoubleDouble) -> tuple[FloatArray, FloatArray]:
@@ -125,8 +130,7 @@ def exact_sums(form: Form, residuals: ExactResiduals, shift: DoubleDouble) -> tu
     in p and q, |M^-1/2 (p, q)|^2.
     """
     with np.errstate(all="ignore"):
-        no_data = exact(np.zeros((form.problem.measurements, shift.high.shape[1])))
-        certifier = _Certifier(form, residuals, shift, no_data)
+        certifier = _Certifier(form, residuals, shift, _no_data(form, shift))
         (u, multipliers), *_ = certifier.refined()
         return certifier.quadratic_form(u, multipliers)
 
@@ -151,8 +155,8 @@ def variance_error(form: Form, residuals: ExactResiduals) -> float:
         largest = worst(relative(error, accurate))
         if count > ALL_CHECKED:
             signs = probe(Purpose.VARIANCE_SIGNS).choice([-1.0, 1.0], (count, 1))
-            no_data = exact(np.zeros((form.problem.measurements, 1)))
-            largest = max(largest, worst(refine(form, residuals, prior.apply_root_transposed(signs), no_data).first))
+            shift = exact(prior.apply_root_transposed(signs))
+            largest = max(largest, worst(refine(form, residuals, shift).first))
     return SAFETY * largest + last_digit(variance)
 
 

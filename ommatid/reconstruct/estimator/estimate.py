@@ -28,7 +28,7 @@ from ..forms.square_root import square_root
 from ..output.run_json import RejectedForm, SolverReport
 from ..problem import Form, NotSolvableError, Problem
 from .certificate import RefinedSolution, estimate_rounding, refine, variance_error, variance_rounding
-from .residuals import DoubleDouble, ExactResiduals
+from .residuals import DoubleDouble, ExactResiduals, exact
 
 TOLERANCE = 1e-8
 LEAST_DIGITS = 1.0  # digits that the condition number must leave to a form that squares the matrix
@@ -190,7 +190,7 @@ def _with_estimate(
 ) -> tuple[SolverReport, RefinedSolution]:
     with np.errstate(all="ignore"):
         deviation = residuals.recorded(recorded)
-    refined = refine(form, residuals, np.zeros((form.problem.prior.dimension, 1)), deviation)
+    refined = refine(form, residuals, exact(np.zeros((form.problem.prior.dimension, 1))), deviation)
     bound = float(refined.bound[0]) + EPS
     bound += estimate_rounding(form, refined.coefficients[:, 0], refined.multipliers[:, 0])
     if bound <= USEFUL_BOUND:

@@ -53,11 +53,6 @@ def exact(values: FloatArray) -> DoubleDouble:
     return DoubleDouble(values, np.zeros_like(values))
 
 
-def as_exact(values: FloatArray | DoubleDouble) -> DoubleDouble:
-    """Return double-double numbers as they are, and convert a float64 array without error."""
-    return values if isinstance(values, DoubleDouble) else exact(values)
-
-
 @dataclass(frozen=True)
 class SparseRows:
     """A matrix stored for `times`: (width, rows) `data` and the column `index` of each entry."""
@@ -163,13 +158,16 @@ class ExactResiduals:
 
     def forward(self, coefficients: DoubleDouble) -> DoubleDouble:
         """Apply H L."""
-        prior = self.problem.prior
-        image = coefficients.scaled(prior.root[:, None]) if prior.independent else self._root[0].times(coefficients)
-        return self._matrix.times(image)
+        return self._matrix.times(self.root(coefficients))
 
     def adjoint(self, measurements: DoubleDouble) -> DoubleDouble:
         """Apply L^T H^T."""
         return self.root_transposed(self._transposed.times(measurements))
+
+    def root(self, coefficients: DoubleDouble) -> DoubleDouble:
+        """Apply L."""
+        prior = self.problem.prior
+        return coefficients.scaled(prior.root[:, None]) if prior.independent else self._root[0].times(coefficients)
 
     def root_transposed(self, image: DoubleDouble) -> DoubleDouble:
         """Apply L^T."""
@@ -199,9 +197,7 @@ class ExactResiduals:
 
     def image(self, u: DoubleDouble) -> DoubleDouble:
         """Return f0 + L u, (N, 1), of u, (K, 1)."""
-        prior = self.problem.prior
-        deviation = u.scaled(prior.root[:, None]) if prior.independent else self._root[0].times(u)
-        return exact(prior.mean[:, None]) + deviation
+        return exact(self.problem.prior.mean[:, None]) + self.root(u)
 
     def contradiction(self, recorded: FloatArray, u: DoubleDouble) -> float:
         """Return the largest relative misfit |g - H f|_i / (|g| + |H| |f|)_i of the measurements without noise.

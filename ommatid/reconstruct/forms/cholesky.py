@@ -122,10 +122,7 @@ class Information(Form):
 
     def variance(self) -> FloatArray:
         """Return the diagonal of L (I + B^T B)^-1 L^T."""
-        if self.problem.prior.independent:
-            return self.problem.prior.variance * np.diagonal(self.inverse)
-        root = self.problem.prior.root
-        return np.maximum(np.einsum("ij,ij->i", root @ self.inverse, root), 0.0)
+        return np.maximum(self.problem.prior.variance_of(self.inverse), 0.0)
 
     def pixel_solutions(self, pixels: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
         """Take u from the inverse, which costs a third of solving for every pixel."""

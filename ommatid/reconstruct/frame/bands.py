@@ -170,8 +170,8 @@ class Bands:
             waves = waves * self.spectrum
             self._subtract_seen(waves)
         solved: FloatArray = np.asarray(fft.idctn(waves, 2, norm="ortho", workers=processors(), overwrite_x=True))
-        for strip in self._strips if edges else ():
-            strip.add(scaled, solved)
+        for edge in self._edges.values() if edges else ():
+            edge.add(scaled, solved)
         for rows, columns, excess in self._corners if edges else ():
             near = scaled[rows, columns]
             solved[rows, columns] += (excess @ near.ravel()).reshape(near.shape)
@@ -196,13 +196,8 @@ class Bands:
             waves -= self.spectrum * row * self._unfolded(np.ascontiguousarray(back[..., number]))
 
     @cached_property
-    def _strips(self) -> tuple[Strip, ...]:
-        """What lacks at the top, bottom, left and right: K has no readings there that M has."""
-        return tuple(edge.strip for edge in self._edges.values())
-
-    @cached_property
     def _edges(self) -> dict[tuple[int, bool], _Edge]:
-        """K_e and M_e along axis 0 or 1, at its first or last end."""
+        """What lacks along axis 0 or 1, at its first or last end: K has no readings there that M has."""
         return {(axis, last): self._edge(axis, last) for axis, last in product((0, 1), (False, True))}
 
     def _edge(self, axis: int, last: bool) -> _Edge:
@@ -425,6 +420,24 @@ def bands_of(camera: Camera, detail: int, spectrum: FloatArray, weights: FloatAr
     return replace(bands, types=tuple(types), simpler=bands)
 
 
+def leaves_null_space(camera: Camera) -> bool:
+    """Return True unless three lens types with footprints of pairwise coprime whole sides, m x m each, see the frame.
+
+    Two of them leave 2 (m - 1) (n - 1) dimensions and more (docs/equations.md), and errors that reach far.
+    """
+    squares = {down for down, across in (lens_type.footprint for lens_type in camera.types) if down == across}
+    whole = sorted(int(side) for side in squares if side.denominator == 1)
+    return (
+        not any(
+            np.gcd(a, b) == np.gcd(a, c) == np.gcd(b, c) == 1
+            for i, a in enumerate(whole)
+            for j, b in enumerate(whole[i + 1 :], i + 1)
+            for c in whole[j + 1 :]
+        )
+        and 1 not in whole
+    )
+
+
 def _by_kernel(lens_type: LensType, kernel: FloatArray, detail: int) -> Readings:
     """Return the readings by a kernel, and its mirror images, one pixel of f apart in the field of a lens type."""
     first, count = list[int](), list[int]()
@@ -520,15 +533,27 @@ class _Edge:
     seen: FloatArray
     whole: FloatArray
 
-    @property
-    def strip(self) -> Strip:
-        """What the strip adds to P."""
+    @cached_property
+    def excess(self) -> FloatArray:
+        """K_e^-1 - M_e^-1: (groups, depth F, depth F)."""
         count = self.seen.shape[1] * self.seen.shape[2]
         seen, whole = (np.linalg.inv(each.reshape(-1, count, count)) for each in (self.seen, self.whole))
         excess = seen - whole
         values, vectors = np.linalg.eigh((excess + excess.swapaxes(1, 2)) / 2)
         values = np.where(values > LEAST * values[:, -1:], values, 0.0)
-        return Strip(self.axis, self.part, self.members, (vectors * values[:, None, :]) @ vectors.swapaxes(1, 2))
+        return (vectors * values[:, None, :]) @ vectors.swapaxes(1, 2)
+
+    def add(self, right: FloatArray, solution: FloatArray) -> None:
+        """Add R^T (K_e^-1 - M_e^-1) R r to the solution."""
+        source, target = (right, solution) if self.axis == 0 else (right.T, solution.T)
+        waves = np.asarray(fft.dct(source[self.part], 2, axis=1, norm="ortho", workers=processors()))
+        missing = self.members < 0
+        groups = waves[:, self.members]  # (depth, groups, F)
+        groups[:, missing] = 0.0
+        depth, count, detail = groups.shape
+        solved = np.einsum("kij,kj->ki", self.excess, groups.swapaxes(0, 1).reshape(count, -1))
+        waves[:, self.members[~missing]] = solved.reshape(count, depth, detail).swapaxes(0, 1)[:, ~missing]
+        target[self.part] += np.asarray(fft.idct(waves, 2, axis=1, norm="ortho", workers=processors()))
 
     def on_corner(self, near: slice, along: slice, size: int) -> tuple[FloatArray, FloatArray]:
         """Return K_e and M_e of some lines of the strip and a part of its length, numbered by lines: (pixels, pixels).
@@ -556,28 +581,6 @@ def _ending(part: slice, last: bool) -> slice:
     """Return the CORNER lines of a strip at its edge."""
     depth = min(CORNER, part.stop - part.start)
     return slice(part.stop - depth, part.stop) if last else slice(part.start, part.start + depth)
-
-
-@dataclass(frozen=True)
-class Strip:
-    """K_e^-1 - M_e^-1 of a strip along an edge, by groups of waves along it: (groups, depth F, depth F)."""
-
-    axis: int
-    part: slice
-    members: IntArray
-    excess: FloatArray
-
-    def add(self, right: FloatArray, solution: FloatArray) -> None:
-        """Add R^T (K_e^-1 - M_e^-1) R r to the solution."""
-        source, target = (right, solution) if self.axis == 0 else (right.T, solution.T)
-        waves = np.asarray(fft.dct(source[self.part], 2, axis=1, norm="ortho", workers=processors()))
-        missing = self.members < 0
-        groups = waves[:, self.members]  # (depth, groups, F)
-        groups[:, missing] = 0.0
-        depth, count, detail = groups.shape
-        solved = np.einsum("kij,kj->ki", self.excess, groups.swapaxes(0, 1).reshape(count, -1))
-        waves[:, self.members[~missing]] = solved.reshape(count, depth, detail).swapaxes(0, 1)[:, ~missing]
-        target[self.part] += np.asarray(fft.idct(waves, 2, axis=1, norm="ortho", workers=processors()))
 
 
 def _at(axis: int, part: slice) -> tuple[slice, ...]:

@@ -15,8 +15,8 @@ describe the field, P is some steps with the few that matter most.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
 from typing import Protocol
@@ -33,13 +33,12 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.observation import Observation
 
-from ..methods.method import EstimationTask, PosteriorOperators, is_uniform
-from .bands import Bands, bands_of
+from ..methods.method import EstimationTask, is_uniform
+from .bands import Bands, bands_of, leaves_null_space
 
 Indices = NDArray[np.intp]
 
 ACCURACY = 0.01  # numerical error, in posterior standard deviations
-MEAN_ACCURACY = 0.01  # of operators for means over the frame, likewise
 SUM_ACCURACY = 5e-3  # of the variance of a weighted sum of pixels, relative
 MAX_STEPS = 600
 MAX_STARTS = 3  # each from the recomputed residual
@@ -83,17 +82,17 @@ class FrameSystem:
 
     weights : (M,) 1 / Rv, 0 for sensor pixels that are not used
     prior : 1 / P0 of independent pixels, or 1 / its spectrum, (rows, columns), under the DCT-II
-    bands : the shift-invariant camera like this one, which gives P; None: steps without one
-    types : the measurements of each lens type, over which weights are averaged; none: parts of `observation`
+    bands : the shift-invariant camera like this one, which gives P
+    types : the measurements of each lens type, over which weights are averaged
     similar : P of the same prior and similar weights, or exact; None to make one of `bands`
     """
 
     observation: Observation
     weights: FloatArray
     prior: float | FloatArray
-    bands: Bands | None = field(default=None, kw_only=True)
-    types: tuple[slice, ...] = field(default=(), kw_only=True)
-    similar: Preconditioner | None = field(default=None, kw_only=True)
+    bands: Bands
+    types: tuple[slice, ...]
+    similar: Preconditioner | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -119,11 +118,11 @@ class FrameSystem:
         return self.observation.adjoint(self.weights * readings)
 
     @cached_property
-    def preconditioner(self) -> Preconditioner | None:
+    def preconditioner(self) -> Preconditioner:
         """P of all kernels or their means, by the mean weights or scaled by local ones: what takes the fewest steps."""
-        if self.similar is not None or self.bands is None:
+        if self.similar is not None:
             return self.similar
-        pairs = zip(self._types, self.mean_weights, strict=True)
+        pairs = zip(self.types, self.mean_weights, strict=True)
         found = self._fastest(self.bands, *([] if self.bands.simpler is None else [self.bands.simpler]))
         if all(float(np.ptp(self.weights[part])) <= EVEN * weight for part, weight in pairs):
             return found
@@ -142,7 +141,7 @@ class FrameSystem:
     @cached_property
     def _local_weights(self) -> tuple[FloatArray, FloatArray]:
         """H^T w of the weights, and of their means over each lens type: (N,) each."""
-        means = np.repeat(self.mean_weights, [part.stop - part.start for part in self._types])
+        means = np.repeat(self.mean_weights, [part.stop - part.start for part in self.types])
         return self.observation.adjoint(self.weights), self.observation.adjoint(means)
 
     def _fastest(self, *candidates: Bands) -> Bands:
@@ -158,33 +157,29 @@ class FrameSystem:
 
         right : (N,) b
         """
-        image, lanczos, bound = np.zeros_like(right), _Lanczos(), np.inf
-        least = reduction * self._bound(self._waves(right))
+        image, least = np.zeros_like(right), reduction * self._bound(self._waves(right))
         with one_thread():
-            for waves in self._residuals(image, right.copy(), lanczos):
-                bound = self._bound(waves)
-                if bound <= least or lanczos.count >= most:
-                    break
-        return image, bound
-
-    @property
-    def _types(self) -> Sequence[slice]:
-        return self.types or self.observation.slices
+            return image, self._iterate(image, right, least, most, _Lanczos())
 
     @property
     def mean_weights(self) -> tuple[float, ...]:
         """Mean weight of each lens type."""
-        return tuple(float(self.weights[part].mean()) for part in self._types)
+        return tuple(float(self.weights[part].mean()) for part in self.types)
 
     def solve(self, right: FloatArray, accuracy: float = ACCURACY, progress: Progress = no_progress) -> Solution:
         """Return C b with an error of at most `accuracy` posterior standard deviations in every pixel.
 
         Raises NotReachedError if the iteration does not get there.
         """
+        most = MOST_OUTER if isinstance(self.similar, Refined) else MAX_STEPS
         with one_thread():  # dot products gain nothing from threads and wait for them
-            image, residual, lanczos = np.zeros_like(right), right.copy(), _Lanczos()
+            image, residual, lanczos = np.zeros_like(right), right, _Lanczos()
             for _ in range(MAX_STARTS):
-                image, lanczos = self._iterated(image, residual, accuracy, lanczos, progress)
+                again = _Lanczos()
+                bound = self._iterate(image, residual, accuracy, most, again, progress)
+                if not bound <= accuracy:
+                    raise NotReachedError(self._not_reached(bound, again.count, accuracy))
+                lanczos = again if again.count else lanczos
                 residual = right - self.apply(image)  # the recursive residual excludes rounding errors
                 bound = self._bound(self._waves(residual))
                 if bound <= accuracy:
@@ -214,22 +209,28 @@ class FrameSystem:
         except NotReachedError:
             return self.solve(weights, accuracy).image
 
-    def _iterated(
-        self, start: FloatArray, start_residual: FloatArray, accuracy: float, before: _Lanczos, progress: Progress
-    ) -> tuple[FloatArray, _Lanczos]:
-        """Run conjugate gradients from `start` until the recursive residual meets the bound."""
-        image, lanczos, first = start.copy(), _Lanczos(), 0.0
-        most = MOST_OUTER if isinstance(self.similar, Refined) else MAX_STEPS
-        for waves in self._residuals(image, start_residual.copy(), lanczos):
+    def _iterate(
+        self,
+        image: FloatArray,
+        residual: FloatArray,
+        accuracy: float,
+        most: int,
+        lanczos: _Lanczos,
+        progress: Progress = no_progress,
+    ) -> float:
+        """Improve an image by conjugate gradients until its recursive residual meets a bound, or `most` steps are done.
+
+        Returns the bound that is reached.
+        """
+        first = bound = np.inf
+        for waves in self._residuals(image, residual.copy(), lanczos):
             bound = self._bound(waves)
-            first = bound if not lanczos.count else first
-            if lanczos.count:
+            first = first if lanczos.count else bound
+            if lanczos.count and accuracy > 0:
                 progress(min(1.0, float(np.log(first / bound) / np.log(first / accuracy)) if bound > 0 else 1.0))
-            if bound <= accuracy:
+            if bound <= accuracy or lanczos.count >= most or not np.isfinite(bound):
                 break
-            if lanczos.count >= most or not np.isfinite(bound):
-                raise NotReachedError(self._not_reached(bound, lanczos.count, accuracy))
-        return image, lanczos if lanczos.count else before
+        return bound
 
     def _residuals(self, image: FloatArray, residual: FloatArray, lanczos: _Lanczos) -> Iterator[FloatArray]:
         """Yield the waves of the residual before each step of conjugate gradients, which change both arguments.
@@ -264,8 +265,7 @@ class FrameSystem:
             residual -= lanczos.lengths[-1] * product
 
     def _not_reached(self, bound: float, steps: int, accuracy: float) -> str:
-        finer = self.bands is not None and self.bands.detail > 1
-        other = "raise the noise" if finer else "set estimator.method = 'tiles'"
+        other = "raise the noise" if self.bands.detail > 1 else "set estimator.method = 'tiles'"
         return (
             f"the frame solver reached {bound:.2g} posterior standard deviations after {steps} steps, expected"
             f" {accuracy:g}; {other}, or raise estimator.accuracy"
@@ -283,10 +283,8 @@ class FrameSystem:
         return float(np.sum(np.square(waves) / self.prior)) ** 0.5
 
     def _precondition(self, residual: FloatArray, waves: FloatArray) -> FloatArray:
-        preconditioner, image = self.preconditioner, residual.reshape(self.shape)
-        if preconditioner is None:
-            return residual
-        return preconditioner.solve(image, None if isinstance(self.prior, float) else waves).ravel()
+        known = None if isinstance(self.prior, float) else waves
+        return self.preconditioner.solve(residual.reshape(self.shape), known).ravel()
 
 
 @dataclass(frozen=True)
@@ -296,7 +294,7 @@ class Refined:
     system: FrameSystem
 
     @classmethod
-    def of(cls, system: FrameSystem, similar: Preconditioner | None) -> Preconditioner | None:
+    def of(cls, system: FrameSystem, similar: Preconditioner) -> Preconditioner:
         """Return that of a system with cheaper kernels, whose own P is `similar`; that itself where there are none."""
         cheaper = system.observation.cheaper
         return similar if cheaper is system.observation else cls(replace(system, observation=cheaper, similar=similar))
@@ -316,30 +314,7 @@ def frame_system(task: EstimationTask) -> FrameSystem:
     prior, observation, camera = task.precision_on(task.shape), task.model.applied, task.model.camera
     spectrum = np.broadcast_to(1 / np.asarray(prior), task.shape)
     bands = bands_of(camera, task.finer, spectrum, weights, observation)
-    return FrameSystem(observation, weights, prior, bands=bands, types=tuple(camera.type_slices()))
-
-
-def mean_accuracy(task: EstimationTask) -> float:
-    """Return the accuracy of solutions for means over the frame.
-
-    The bound on the largest error of a pixel is sqrt(N) times the mean error or more.
-    """
-    return max(task.settings.accuracy, MEAN_ACCURACY * task.model.unknowns**0.5 / task.finer)
-
-
-def posterior_operators(
-    system: FrameSystem,
-    task: EstimationTask,
-    posterior: Callable[[FloatArray], FloatArray],
-    of_weights: Callable[[FloatArray], FloatArray] | None = None,
-) -> PosteriorOperators:
-    """Return A, C and their kin from C, `posterior`; of_weights : C of weights of pixels, None: the same."""
-    return PosteriorOperators(
-        gain=lambda values: posterior(system.right_hand_side(task.on_all_measurements(values, 0.0))),
-        posterior=posterior if of_weights is None else of_weights,
-        weigh=lambda values: values / task.expected_noise,
-        hidden=lambda image: posterior(system.apply_prior_precision(image)),
-    )
+    return FrameSystem(observation, weights, prior, bands, tuple(camera.type_slices()))
 
 
 class _Lanczos:
@@ -423,21 +398,3 @@ def band_width(camera: Camera) -> int:
     """Return the width of the band of K for the designed camera, without blur or distortion."""
     widest = max(ceil(lens_type.ratio) for lens_type in camera.types)
     return widest * (min(camera.shape) + 1)
-
-
-def leaves_null_space(camera: Camera) -> bool:
-    """Return True unless three lens types with footprints of pairwise coprime whole sides, m x m each, see the frame.
-
-    Two of them leave 2 (m - 1) (n - 1) dimensions and more (docs/equations.md), and errors that reach far.
-    """
-    squares = {down for down, across in (lens_type.footprint for lens_type in camera.types) if down == across}
-    whole = sorted(int(side) for side in squares if side.denominator == 1)
-    return (
-        not any(
-            np.gcd(a, b) == np.gcd(a, c) == np.gcd(b, c) == 1
-            for i, a in enumerate(whole)
-            for j, b in enumerate(whole[i + 1 :], i + 1)
-            for c in whole[j + 1 :]
-        )
-        and 1 not in whole
-    )

@@ -23,10 +23,11 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.observation import Entries
 
 from ..methods.method import EstimationTask
-from .conjugate_gradients import BandedFactor, FrameSystem, NotReachedError, leaves_null_space
+from .bands import leaves_null_space
+from .conjugate_gradients import BandedFactor, FrameSystem, NotReachedError
 from .reading_space import ReadingSpace
 from .swept import swept_maps
-from .variance_map import VarianceMap, frame_map, is_narrow, is_uneven, unseen_corners, ways_to_edges
+from .variance_map import EVEN_EDGES, VarianceMap, Way, frame_map, is_narrow, mean_ratios, ways_to_edges
 from .windows import HALOS, Windows, by_windows, has_few_windows, of_mean_kernels, varies_over_field, windows_map
 
 Pixels = NDArray[np.intp]
@@ -138,7 +139,7 @@ def error_map(task: EstimationTask, system: FrameSystem, actual: FloatArray, *, 
     actual : (measurements used,) noise
     quick : True takes the fastest map, unchecked, though it is rough: that of a similar shift-invariant camera
     """
-    prior = task.prior.variance if system.bands is None else system.bands.prior_variance
+    prior = system.bands.prior_variance
     if isinstance(system.similar, ReadingSpace):
         maps = VarianceMap(*system.similar.moments.variances(task.expected_noise, actual, task.shape_of_f))
         rounding = system.similar.rounding(maps.posterior.ravel())
@@ -168,9 +169,17 @@ def _is_small(task: EstimationTask, readings: int) -> bool:
 
 
 def _fastest_map(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> VarianceMap:
-    if system.bands is None:
+    if isinstance(system.similar, BandedFactor):
         return next(_maps(task, system, actual))
-    return frame_map(task, system, system.bands, actual, ways_to_edges(task, system.bands)[0], quick=True)
+    return map_by_bands(task, system, actual, ways_to_edges(task, system.bands)[0], quick=True)
+
+
+def map_by_bands(
+    task: EstimationTask, system: FrameSystem, actual: FloatArray, way: Way, *, quick: bool = False
+) -> VarianceMap:
+    """Return the map of the shift-invariant camera like that of a system; arguments as of `frame_map`."""
+    ratios, level = mean_ratios(task, system.weights, actual), np.log(system.levels(task.of_f))
+    return frame_map(task, system.bands, ratios, level, way, quick=quick)
 
 
 def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iterator[VarianceMap]:
@@ -180,44 +189,25 @@ def _maps(task: EstimationTask, system: FrameSystem, actual: FloatArray) -> Iter
         prior, reach = float(np.asarray(system.prior)), task.model.windowed.reach
         yield VarianceMap(*swept_maps(system.similar.matrix, system.weights, ratios, prior, task.shape, reach))
         return
-    if system.bands is None:
-        raise TypeError("expected a system with a preconditioner")
     few, narrow = task.model.unknowns <= MANY, is_narrow(task)
-    uneven, applied = is_uneven(task, system), task.model.applied
+    level, applied = np.log(system.levels(task.of_f)), task.model.applied
+    uneven = float(np.ptp(level)) > EVEN_EDGES
     varies = varies_over_field(applied)
     all_windows = few and task.finer == 1
     if is_invariant(task) and not (narrow and uneven) and not (varies and all_windows):
         for way in ways_to_edges(task, system.bands):
-            maps = frame_map(task, system, system.bands, actual, way)
-            maps = by_windows(maps, task, applied, actual, of_mean_kernels(applied)) if varies else maps
-            yield _with_corners(maps, task, system, actual) if narrow else maps
+            maps = map_by_bands(task, system, actual, way)
+            yield by_windows(maps, task, applied, actual, of_mean_kernels(applied)) if varies else maps
         if not (all_windows and uneven):
             return
     elif task.finer > 1 and task.shape_of_f[0] * task.shape_of_f[1] > MANY:  # all windows would take an hour
-        maps = frame_map(task, system, system.bands, actual, "edges")
+        maps = map_by_bands(task, system, actual, "edges")
         yield by_windows(maps, task, applied, actual)
         return
-    far = has_few_windows(task) or not task.model.camera.has_sharp_footprints
-    far = far or np.log(system.levels(task.of_f)).std() > SPREAD
+    far = has_few_windows(task) or not task.model.camera.has_sharp_footprints or level.std() > SPREAD
     halos = HALOS[int(far) :]
     for halo in halos if few and not narrow else halos[:1]:
         yield windows_map(task, system.weights, system.bands, actual, halo)
-
-
-def _with_corners(maps: VarianceMap, task: EstimationTask, system: FrameSystem, actual: FloatArray) -> VarianceMap:
-    """Replace the variances of corner pixels where two edges meet that some lens types do not see by exact solutions.
-
-    Errors of independent pixels reach along both edges there, and no strip shows them.
-    """
-    found = np.array([maps.posterior, maps.missing, maps.noisy])
-    noise = system.weights**2 * task.on_all_measurements(actual, 0.0)
-    for corner in [] if system.bands is None else unseen_corners(system.bands):
-        unit = np.zeros(task.shape)
-        unit[corner] = 1.0
-        solved = system.solve(unit.ravel(), task.settings.accuracy).image
-        missing = float(solved @ system.apply_prior_precision(solved))
-        found[:, *corner] = solved @ unit.ravel(), missing, noise @ np.square(system.observation.forward(solved))
-    return VarianceMap(*found)
 
 
 def is_invariant(task: EstimationTask) -> bool:

@@ -42,8 +42,6 @@ from .conjugate_gradients import (
     Refined,
     Solution,
     frame_system,
-    mean_accuracy,
-    posterior_operators,
     serves,
 )
 from .error_map import MANY, ErrorMap, error_map, is_invariant
@@ -55,6 +53,7 @@ NULL_SPACE = "the lens types leave a null space or see edges otherwise: K is fac
 INVARIANT = "every lens type is shift-invariant except at the edges"
 ELSEWHERE = "the lens types do not see alike everywhere: windows give the error bars"
 WORLD = "the world finer than f is estimated, and f's pixels are its averages"
+MEAN_ACCURACY = 0.01  # of operators for means over the frame, in posterior standard deviations
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
 SIMILAR = 0.1  # relative difference of mean weights up to which a preconditioner serves, which costs a step at most
 ERRORS = "errors"  # name of a FrameError among what frames share
@@ -78,10 +77,12 @@ class FrameError:
 class FrameMethod(Method):
     """Estimation of all pixels at once by conjugate gradients."""
 
-    def __init__(self, task: EstimationTask, execution: Execution) -> None:
-        """Raises InputError if a measurement has no noise."""
+    def __init__(self, task: EstimationTask, execution: Execution, *, little_memory: bool = False) -> None:
+        """Raises InputError if a measurement has no noise; little_memory : True where K is never factorised."""
         super().__init__(task, execution)
-        self._banded = task.finer == 1 and task.prior.kind == "independent" and serves(task.model.camera)
+        self._banded = (
+            not little_memory and task.finer == 1 and task.prior.kind == "independent" and serves(task.model.camera)
+        )
         self._start, self._nearly = None, None  # solutions from which those of this method start
         self._lacking: tuple[FloatArray, FloatArray] | None = None  # the last image of `_hidden`, and its result
         nearby = execution.nearby
@@ -103,9 +104,9 @@ class FrameMethod(Method):
         """The linear system of the frame."""
         system = frame_system(self.task)
         if self._banded:
-            exact, matrix = replace(system, bands=None), self.task.model.matrix
-            factor, _ = self.shared("factor", self.conditions(), lambda: BandedFactor(exact, matrix))
-            return replace(exact, similar=factor)
+            matrix = self.task.model.matrix
+            factor, _ = self.shared("factor", self.conditions(), lambda: BandedFactor(system, matrix))
+            return replace(system, similar=factor)
         if ReadingSpace.serves(self.task):
             conditions = replace(self.conditions(), assumed=np.ones(0))
             found, _ = self.shared("moments", conditions, lambda: moments_of(self.task))
@@ -136,7 +137,7 @@ class FrameMethod(Method):
     @cached_property
     def preliminary_of_mean(self) -> FloatArray:
         """The estimate where the image's level is the prior's mean, to the accuracy of means over the image: (N,)."""
-        self._start = self._solved(self._right, mean_accuracy(self.task), self._start).image
+        self._start = self._solved(self._right, self._mean_accuracy, self._start).image
         return self._start + self.task.prior.mean
 
     @property
@@ -162,8 +163,8 @@ class FrameMethod(Method):
 
     def operators(self) -> PosteriorOperators:
         """Return the operators of the estimate, to a mean error of a hundredth of a posterior standard deviation."""
-        found = posterior_operators(self.system, self.task, self._solve, self._solve_weights)
-        return replace(found, hidden=self._hidden)
+        noise = self.task.expected_noise
+        return PosteriorOperators(self._gain, self._solve_weights, lambda values: values / noise, self._hidden)
 
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""
@@ -238,7 +239,7 @@ class FrameMethod(Method):
     @property
     def quick_bands(self) -> Bands | None:
         """The camera's transfer functions where they are enough, None where random images are to be solved for."""
-        return self.system.bands if self.execution.quick else None
+        return self.system.bands if self.execution.quick and not self._banded else None
 
     @property
     def _draws(self) -> int:
@@ -247,8 +248,7 @@ class FrameMethod(Method):
 
     def _mean_square(self, readings: FloatArray) -> float:
         """Return the mean square of f's pixels in A g; readings : (measurements used,) g."""
-        right = self.system.right_hand_side(self.task.on_all_measurements(readings, 0.0))
-        return float(np.square(self.task.of_f(self._solve(right))).mean())
+        return float(np.square(self.task.of_f(self._gain(readings))).mean())
 
     def _random_power(self, actual: FloatArray, freedoms: float) -> ResidualPower:
         """Return the expected squares of the residual, by solutions for random images and noise, of f0 as true image.
@@ -286,9 +286,7 @@ class FrameMethod(Method):
 
     def _residual(self, column: FloatArray) -> FloatArray:
         """Return (I - H A) x: (measurements used,)."""
-        task = self.task
-        right = self.system.right_hand_side(task.on_all_measurements(column, 0.0))
-        observed = task.observe(self._solve(right))
+        observed = self.task.observe(self._gain(column))
         return np.subtract(column, observed, out=observed)
 
     def _hidden(self, deviation: FloatArray) -> FloatArray:
@@ -297,13 +295,26 @@ class FrameMethod(Method):
             self._lacking = deviation, self._solve(self.system.apply_prior_precision(deviation))
         return self._lacking[1]
 
+    @property
+    def _mean_accuracy(self) -> float:
+        """The accuracy of solutions for means over the frame.
+
+        The bound on the largest error of a pixel is sqrt(N) times the mean error or more.
+        """
+        task = self.task
+        return max(task.settings.accuracy, MEAN_ACCURACY * task.model.unknowns**0.5 / task.finer)
+
     def _solve(self, right: FloatArray) -> FloatArray:
         """Return C b for a mean over the frame, to a mean error of a hundredth of a posterior standard deviation."""
-        return self.system.solve(right, mean_accuracy(self.task)).image
+        return self.system.solve(right, self._mean_accuracy).image
+
+    def _gain(self, readings: FloatArray) -> FloatArray:
+        """Return A g likewise: (measurements used,) to (unknowns,)."""
+        return self._solve(self.system.right_hand_side(self.task.on_all_measurements(readings, 0.0)))
 
     def _solve_weights(self, weights: FloatArray) -> FloatArray:
         """Return C w of weights of the unknowns, to an accuracy relative to w^T C w."""
-        return self.system.solve_weights(weights, mean_accuracy(self.task))
+        return self.system.solve_weights(weights, self._mean_accuracy)
 
     def _variance_of_sum(self, weights: FloatArray, actual: FloatArray) -> float:
         """Eq. 5 of w^T f^."""

@@ -48,8 +48,7 @@ class ReadingSpace:
 
     @cached_property
     def _factor(self) -> tuple[FloatArray, bool]:
-        covariance = self.moments.readings + np.diag(self.noise)
-        return linalg.cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
+        return self.moments.factor(self.noise)
 
     @cached_property
     def leverage(self) -> FloatArray:

@@ -23,9 +23,8 @@ from ommatid.runtime.machine import processors
 from ..forms.cholesky import factorise_positive
 from ..methods.method import EstimationTask
 from ..prior import averaged_spectrum, cosine_waves
-from ..problem import is_dense
-from .bands import Bands
-from .conjugate_gradients import FrameSystem, leaves_null_space
+from ..problem import dense_or_sparse, gram
+from .bands import Bands, leaves_null_space
 from .swept import swept_maps
 
 SIDE, FINE_SIDE, QUICK_SIDE = 40, 18, 24  # pixels of f of a small frame, where the world is finer, and for a mean
@@ -70,11 +69,14 @@ class Moments:
         """Return those of some pixels of f, (n,)."""
         return Moments(self.pixels[pixels], self.both[pixels], self.readings)
 
+    def factor(self, noise: FloatArray) -> tuple[FloatArray, bool]:
+        """Return the Cholesky factor of the covariance of readings with these noise variances, (M,)."""
+        covariance = self.readings + np.diag(noise)
+        return linalg.cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
+
     def variances(self, expected: FloatArray, actual: FloatArray, shape: tuple[int, ...]) -> FloatArray:
         """Return the three maps for readings with these noise variances, (M,): (3, rows, columns)."""
-        covariance = self.readings + np.diag(expected)
-        factor = linalg.cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
-        gain = np.asarray(linalg.cho_solve(factor, self.both.T, check_finite=False)).T
+        gain = np.asarray(linalg.cho_solve(self.factor(expected), self.both.T, check_finite=False)).T
         posterior = self.pixels - np.einsum("ij,ij->i", gain, self.both)
         squares = np.square(gain)
         missing = np.maximum(posterior - squares @ expected, 0.0)
@@ -86,7 +88,7 @@ def moments(matrix: sparse.csr_array, spectrum: FloatArray, detail: int) -> Mome
     fine, shape = spectrum.shape, (spectrum.shape[0] // detail, spectrum.shape[1] // detail)
     count = matrix.shape[0]
     both, readings = np.empty((shape[0] * shape[1], count)), np.empty((count, count))
-    product = matrix.toarray() if is_dense(matrix) else matrix
+    applied = dense_or_sparse(matrix)
     for start in range(0, count, COLUMNS):
         part = slice(start, min(start + COLUMNS, count))
         waves = fft.dctn(matrix[part].toarray().reshape(-1, *fine), 2, axes=(1, 2), norm="ortho", workers=processors())
@@ -94,7 +96,7 @@ def moments(matrix: sparse.csr_array, spectrum: FloatArray, detail: int) -> Mome
         spread = np.asarray(fft.idctn(waves, 2, axes=(1, 2), norm="ortho", workers=processors(), overwrite_x=True))
         means = spread.reshape(-1, shape[0], detail, shape[1], detail).mean(axis=(2, 4))
         both[:, part] = means.reshape(len(spread), -1).T
-        readings[:, part] = product @ spread.reshape(len(spread), -1).T
+        readings[:, part] = applied @ spread.reshape(len(spread), -1).T
     vertical, horizontal = (np.square(cosine_waves(size)) for size in shape)
     pixels = (vertical @ averaged_spectrum(spectrum, detail) @ horizontal.T).ravel()
     return Moments(pixels, both, (readings + readings.T) / 2)
@@ -110,34 +112,42 @@ def prior_precision(prior: FloatArray, shape: tuple[int, int]) -> FloatArray:
 
 
 def columns_of_covariance(
-    precision: FloatArray, prior: FloatArray, shape: tuple[int, int], pixels: NDArray[np.intp] | None = None
+    precision: FloatArray, prior: FloatArray, pixels: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the columns of C = K^-1 of these pixels, (N, n), and the diagonal of C P0^-1 C at them, (n,).
 
-    precision : (N, N) K of a small frame;  prior : 1 / its spectrum;  pixels : (n,) of few; None: all
+    precision : (N, N) K of a small frame;  prior : (rows, columns) 1 / the spectrum of P0;  pixels : (n,) in ascending
+        order
     """
     factor, _ = factorise_positive(precision)
-    if pixels is None or pixels.size == precision.shape[0]:
+    if pixels.size == precision.shape[0]:
         columns = factor.inverse()
     else:
         units = np.zeros((precision.shape[0], pixels.size))
         units[pixels, np.arange(pixels.size)] = 1.0
         columns = factor.solve(units)
-    waves = np.asarray(fft.dctn(columns.reshape(*shape, -1), 2, axes=(0, 1), norm="ortho"))
+    waves = np.asarray(fft.dctn(columns.reshape(*prior.shape, -1), 2, axes=(0, 1), norm="ortho"))
     return columns, np.einsum("rc,rcn->n", prior, np.square(waves))
 
 
-def dense_or_sparse(matrix: sparse.csr_array) -> FloatArray | sparse.csr_array:
-    """Return H in the form whose products are faster."""
-    return matrix.toarray() if is_dense(matrix) else matrix
+def dense_maps(
+    matrix: sparse.csr_array,
+    noise: tuple[FloatArray, FloatArray],
+    precision: FloatArray,
+    prior: FloatArray,
+    pixels: NDArray[np.intp],
+) -> FloatArray:
+    """Return the three maps of pixels of a small frame: (3, n).
 
-
-def information(applied: FloatArray | sparse.csr_array, weights: FloatArray) -> FloatArray:
-    """Return H^T diag(w) H of few pixels, (N, N), from H by `dense_or_sparse`."""
-    if isinstance(applied, np.ndarray):
-        scaled = applied * np.sqrt(weights)[:, None]
-        return np.asarray(scaled.T @ scaled, dtype=np.float64)  # of one factor: half the operations
-    return np.asarray((applied.T @ sparse.csr_array(applied.multiply(weights[:, None]))).toarray(), dtype=np.float64)
+    matrix : (M, N) H;  noise : (M,) 1 / Rv, and Rvm / Rv
+    precision, prior, pixels : as of `columns_of_covariance`
+    """
+    covariance, missing = columns_of_covariance(precision, prior, pixels)
+    posterior = covariance[pixels, np.arange(pixels.size)]
+    noisy, (weights, ratios) = posterior - missing, noise
+    if not np.allclose(ratios, 1.0, rtol=1e-9):
+        noisy = (weights * ratios) @ np.square(dense_or_sparse(matrix) @ covariance)
+    return np.array([posterior, missing, noisy])
 
 
 @dataclass(frozen=True)
@@ -147,19 +157,23 @@ class SmallFrame:
     like: Bands
 
     @cached_property
-    def matrices(self) -> list[sparse.csr_array]:
+    def _matrices(self) -> list[sparse.csr_array]:
         """H of each lens type."""
         return [each.matrix(self.like.spectrum.shape, self.like.detail) for each in self.like.types]
 
     @cached_property
+    def matrix(self) -> sparse.csr_array:
+        """H."""
+        return sparse.csr_array(sparse.vstack(self._matrices, format="csr"))
+
+    @cached_property
     def _moments(self) -> Moments:
-        matrix = sparse.csr_array(sparse.vstack(self.matrices, format="csr"))
-        return moments(matrix, self.like.spectrum, self.like.detail)
+        return moments(self.matrix, self.like.spectrum, self.like.detail)
 
     @cached_property
     def _parts(self) -> list[FloatArray]:
         """H^T H of each lens type where the unknowns are f's pixels: (N, N)."""
-        return [information(dense_or_sparse(matrix), np.ones(matrix.shape[0])) for matrix in self.matrices]
+        return [gram(matrix) for matrix in self._matrices]
 
     @cached_property
     def _precision(self) -> FloatArray:
@@ -170,25 +184,18 @@ class SmallFrame:
 
         ratios : of the actual to the expected noise of each lens type
         """
-        like, weights = self.like, level * np.array(self.like.weights)
+        like, of_types = self.like, level * np.array(self.like.weights)
+        weights, every = (self.of_readings(each) for each in (of_types, np.array(ratios)))
         if like.detail > 1:
-            noise, every = 1 / self.of_readings(weights), self.of_readings(np.array(ratios))
-            return self._moments.variances(noise, every * noise, like.shape)
-        first, excess = ratios[0], None
-        for part, weight, ratio in zip(self._parts, weights, ratios, strict=True):
-            if not np.isclose(ratio, first, rtol=1e-12):
-                excess = (ratio - first) * weight * part + (0.0 if excess is None else excess)
-        parts = (weight * part for part, weight in zip(self._parts, weights, strict=True))
-        covariance, missing = columns_of_covariance(sum(parts, self._precision), 1 / like.spectrum, like.shape)
-        posterior = np.diagonal(covariance)
-        noisy = first * (posterior - missing)
-        if excess is not None:
-            noisy += np.einsum("ij,ij->j", covariance, excess @ covariance)
-        return np.array([posterior, missing, noisy]).reshape(3, *like.shape)
+            return self._moments.variances(1 / weights, every / weights, like.shape)
+        parts = (weight * part for part, weight in zip(self._parts, of_types, strict=True))
+        precision, pixels = sum(parts, self._precision), np.arange(like.spectrum.size)
+        found = dense_maps(self.matrix, (weights, every), precision, 1 / like.spectrum, pixels)
+        return found.reshape(3, *like.shape)
 
     def of_readings(self, of_types: FloatArray) -> FloatArray:
         """Return the value of each reading's lens type: (readings,)."""
-        return np.repeat(of_types, [matrix.shape[0] for matrix in self.matrices])
+        return np.repeat(of_types, [matrix.shape[0] for matrix in self._matrices])
 
 
 @dataclass(frozen=True)
@@ -349,21 +356,21 @@ class Strips:
         """Return the maps of lines of a frame along its edge: (3, length, depth)."""
         numbers = np.arange(frame.like.shape[0] * frame.like.shape[1]).reshape(frame.like.shape)
         pixels = (numbers if axis == 1 else numbers.T)[:, lines]
-        matrix = sparse.csr_array(sparse.vstack(frame.matrices, format="csr"))[:, pixels.ravel()]
+        matrix = frame.matrix[:, pixels.ravel()]
         weights, every = (frame.of_readings(np.array(each)) for each in (frame.like.weights, ratios))
         reach = max(max(each.extent) for each in frame.like.types)
         return swept_maps(matrix, level * weights, every, self.prior, pixels.shape, reach)
 
 
 def frame_map(
-    task: EstimationTask, system: FrameSystem, bands: Bands, actual: FloatArray, way: Way, *, quick: bool = False
+    task: EstimationTask, bands: Bands, ratios: tuple[float, ...], level: FloatArray, way: Way, *, quick: bool = False
 ) -> VarianceMap:
     """Return the map of a frame whose lens types see the same everywhere, as `bands` do.
 
-    actual : (measurements used,) noise;  way : to the ratios near the edges, one of `ways_to_edges`
-    quick : True where the mean of the map alone matters
+    ratios : as of `mean_ratios`;  level : logarithms of the weights of each pixel's measurements over their means, (N,)
+    way : to the ratios near the edges, one of `ways_to_edges`;  quick : True where the mean of the map alone matters
     """
-    ratios, shape = mean_ratios(task, system.weights, actual), bands.shape
+    shape = bands.shape
     interior = Interior.of(task, bands)
     edges: Edges | SmallFrames | Strips
     if way == "edges":
@@ -371,7 +378,7 @@ def frame_map(
     elif way == "far":
         edges = SmallFrames.of(task, bands)
     else:
-        edges = Strips.of(task, bands, float(np.asarray(system.prior)))
+        edges = Strips.of(task, bands, 1 / task.prior.variance)
 
     def inside(value: float) -> FloatArray:
         return np.broadcast_to(interior.variances(float(np.exp(value)), ratios)[:, None, None], (3, *shape))
@@ -379,7 +386,7 @@ def frame_map(
     def at_edges(value: float) -> FloatArray:
         return edges.ratios(float(np.exp(value)), ratios)
 
-    return by_levels(np.log(system.levels(task.of_f)).reshape(shape), inside, at_edges)
+    return by_levels(level.reshape(shape), inside, at_edges)
 
 
 def ways_to_edges(task: EstimationTask, bands: Bands) -> list[Way]:
@@ -391,7 +398,7 @@ def ways_to_edges(task: EstimationTask, bands: Bands) -> list[Way]:
     null_space = task.finer == 1 and leaves_null_space(task.model.camera)
     if null_space and task.prior.kind == "independent":
         return ["far"]
-    far: list[Way] = ["far"] if task.finer == 1 and (null_space or unseen_corners(bands)) else []
+    far: list[Way] = ["far"] if task.finer == 1 and (null_space or _leaves_corner(bands)) else []
     return ["swept" if is_narrow(task) else "edges", *far]
 
 
@@ -400,19 +407,15 @@ def is_narrow(task: EstimationTask) -> bool:
     return task.finer == 1 and task.prior.kind == "independent" and task.model.camera.has_sharp_footprints
 
 
-def unseen_corners(bands: Bands) -> list[tuple[int, int]]:
-    """Return the corner pixels of f, (row, column), where two edges meet that some lens types do not see."""
-    ends: list[list[int]] = []
-    for axis, size in enumerate(bands.shape):
-        seen = [(each.first[axis], bands.detail * (each.count[axis] - 1) + each.extent[axis]) for each in bands.types]
-        unseen = any(first > 0 for first, _ in seen), any(sum(each) < size * bands.detail for each in seen)
-        ends.append([place for place, missing in zip((0, size - 1), unseen, strict=True) if missing])
-    return list(product(*ends))  # type: ignore[arg-type]
+def _leaves_corner(bands: Bands) -> bool:
+    """Return True if two edges meet that some lens types do not see."""
 
+    def leaves_edge(axis: int) -> bool:
+        firsts = [each.first[axis] for each in bands.types]
+        lengths = [bands.detail * (each.count[axis] - 1) + each.extent[axis] for each in bands.types]
+        return max(firsts) > 0 or min(map(sum, zip(firsts, lengths, strict=True))) < bands.spectrum.shape[axis]
 
-def is_uneven(task: EstimationTask, system: FrameSystem) -> bool:
-    """Return True if the noise of neighbouring pixels differs."""
-    return float(np.ptp(np.log(system.levels(task.of_f)))) > EVEN_EDGES
+    return leaves_edge(0) and leaves_edge(1)
 
 
 def _with_shape(bands: Bands, task: EstimationTask, shape: tuple[int, int]) -> Bands:

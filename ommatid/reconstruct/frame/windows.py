@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.machine import one_thread, processors
@@ -26,14 +26,14 @@ from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.observation import Entries, Observation, ObservationPart
 
 from ..methods.method import EstimationTask
+from ..problem import dense_or_sparse, gram
 from .bands import Bands
 from .swept import swept_maps
 from .variance_map import (
     Interior,
     VarianceMap,
     columns_of_covariance,
-    dense_or_sparse,
-    information,
+    dense_maps,
     is_narrow,
     mean_ratios,
     moments,
@@ -135,30 +135,18 @@ class Windows:
 
         core : slices of the window's rows and columns;  result : (3, rows, columns) of the core
         """
-        task, shape = self.task, self.shape
-        rows, columns = self._window(corner)
-        numbers = self._near(rows, columns)
+        task, shape, numbers = self.task, self.shape, self._near(corner)
         numbers = numbers[task.used[numbers]]
-        index = task.among_used(numbers)
-        matrix = observation.rows_on(numbers, rows, columns)
-        expected, actual = task.expected_noise[index], self.actual[index]
-        if self.beside:
-            lost = self._seen[numbers] - np.asarray(matrix.sum(axis=1)).ravel()
-            expected, actual = (each + self.beside * np.square(lost) for each in (expected, actual))
+        index, (matrix, beside) = task.among_used(numbers), self._cut(observation, corner, numbers)
+        expected, actual = task.expected_noise[index] + beside, self.actual[index] + beside
         kept = np.arange(shape[0] * shape[1]).reshape(shape)[core]
         if task.finer > 1:
             return moments(matrix, self._spectrum, task.finer).at(kept.ravel()).variances(expected, actual, kept.shape)
         if isinstance(self._prior, float) and is_narrow(task):
-            ratios, reach = actual / expected, min(observation.reach, max(shape))
-            return swept_maps(matrix, 1 / expected, ratios, self._prior, shape, reach)[:, *core]
-        applied = dense_or_sparse(matrix)
-        precision = information(applied, 1 / expected) + self._precision
-        covariance, missing = columns_of_covariance(precision, 1 / self._spectrum, shape, kept.ravel())
-        posterior = covariance[kept.ravel(), np.arange(kept.size)]
-        noisy = posterior - missing
-        if not np.allclose(actual, expected, rtol=1e-9):
-            noisy = (actual / expected**2) @ np.square(applied @ covariance)
-        return np.array([posterior, missing, noisy]).reshape(3, *kept.shape)
+            reach = min(observation.reach, max(shape))
+            return swept_maps(matrix, 1 / expected, actual / expected, self._prior, shape, reach)[:, *core]
+        noise, precision = (1 / expected, actual / expected), gram(matrix, 1 / expected) + self._precision
+        return dense_maps(matrix, noise, precision, 1 / self._spectrum, kept.ravel()).reshape(3, *kept.shape)
 
     def frame(self, observation: Observation) -> VarianceMap:
         """Return the maps of a whole frame from the cores of windows side by side.
@@ -179,7 +167,7 @@ class Windows:
             corner, core = (place[0].first, place[1].first), (place[0].core, place[1].core)
             maps = None
             if first in responses:
-                numbers = self._near(*self._window(corner))
+                numbers = self._near(corner)
                 numbers = numbers[self._order(numbers, corner)]
                 if responses[first].noise.size == numbers.size:  # unless one lies at an edge of the window, by rounding
                     maps = responses[first].maps(*(noise[numbers] for noise in self._noise))
@@ -248,15 +236,12 @@ class Windows:
 
     def _response(self, observation: Observation, corner: tuple[int, int], core: Core) -> Response:
         """Return the maps of the core of a window with even noise, and what they are for other noise."""
-        shape, (rows, columns) = self.shape, self._window(corner)
-        numbers = self._near(rows, columns)
-        order = self._order(numbers, corner)
-        matrix, numbers = observation.rows_on(numbers, rows, columns)[order], numbers[order]
-        lost = self._seen[numbers] - np.asarray(matrix.sum(axis=1)).ravel()
-        beside = self.beside * np.square(lost)
+        shape, numbers = self.shape, self._near(corner)
+        order, (matrix, beside) = self._order(numbers, corner), self._cut(observation, corner, numbers)
+        matrix, beside, numbers = matrix[order], beside[order], numbers[order]
         noise, applied = self._even_noise[numbers] + beside, dense_or_sparse(matrix)
-        precision = information(applied, 1 / noise) + self._precision
-        covariance, missing = columns_of_covariance(precision, 1 / self._spectrum, shape)
+        precision = gram(applied, 1 / noise) + self._precision
+        covariance, missing = columns_of_covariance(precision, 1 / self._spectrum, np.arange(shape[0] * shape[1]))
         kept = np.arange(shape[0] * shape[1]).reshape(shape)[core]
         pixels, of_c = kept.ravel(), applied @ covariance
         of_d = applied @ (covariance @ (self._precision @ covariance[:, pixels]))
@@ -309,11 +294,18 @@ class Windows:
         rows, columns = (slice(first * self.task.finer, (first + side) * self.task.finer) for first, side in pairs)
         return rows, columns
 
-    def _near(self, rows: slice, columns: slice) -> IntArray:
+    def _cut(
+        self, observation: Observation, corner: tuple[int, int], numbers: IntArray
+    ) -> tuple[sparse.csr_array, FloatArray]:
+        """Return H of readings on a window, and the variance by what they see beside it: (m,)."""
+        matrix = observation.rows_on(numbers, *self._window(corner))
+        return matrix, self.beside * np.square(self._seen[numbers] - np.asarray(matrix.sum(axis=1)).ravel())
+
+    def _near(self, corner: tuple[int, int]) -> IntArray:
         """Return the measurements whose middles lie in a window, or beyond an edge that it touches, ascending."""
         (top, bottom), (left, right) = (
             (part.start or -np.inf, part.stop if part.stop < size else np.inf)
-            for part, size in zip((rows, columns), self.task.shape, strict=True)
+            for part, size in zip(self._window(corner), self.task.shape, strict=True)
         )
         order, down = self._by_row
         near = order[np.searchsorted(down, top, "right") : np.searchsorted(down, bottom)]
@@ -352,7 +344,12 @@ def windows_map(task: EstimationTask, weights: FloatArray, bands: Bands, actual:
 
     weights : (M,) 1 / Rv;  bands : of a camera like this one;  actual : (measurements used,) noise
     """
-    return _windows(task, weights, bands, actual, halo).frame(task.model.applied)
+    beside = float(Interior.of(task, bands).variances(1.0, mean_ratios(task, weights, actual))[0])
+    core = (CORE, CORE)
+    if is_narrow(task):
+        widest = max(ceil(each.ratio) for each in task.model.camera.types)
+        core, halo = (LENGTH, SWEPT), max(halo, BOXES * widest)
+    return Windows(task, actual, core, halo, beside).frame(task.model.applied)
 
 
 def has_few_windows(task: EstimationTask) -> bool:
@@ -365,15 +362,6 @@ def _by_edges(count: int, most: int) -> list[tuple[int, ...]]:
     """Return, for each of `count` windows along an axis, the numbers of those that stand for it: at most so many."""
     inside = tuple(np.linspace(0, count - 1, most + 2).round().astype(int)[1:-1].tolist())
     return [(number,) if number in (0, count - 1) else inside for number in range(count)]
-
-
-def _windows(task: EstimationTask, weights: FloatArray, bands: Bands, actual: FloatArray, halo: int) -> Windows:
-    beside = float(Interior.of(task, bands).variances(1.0, mean_ratios(task, weights, actual))[0])
-    core = (CORE, CORE)
-    if is_narrow(task):
-        widest = max(ceil(each.ratio) for each in task.model.camera.types)
-        core, halo = (LENGTH, SWEPT), max(halo, BOXES * widest)
-    return Windows(task, actual, core, halo, beside)
 
 
 def varies_over_field(observation: Observation) -> bool:

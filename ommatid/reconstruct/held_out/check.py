@@ -89,11 +89,6 @@ def check_task(
         raise InputError(
             "estimator.misalignment 'fit' fits H to all sub-imagers at once, so that none is held out; take 'trust'"
         )
-    if not (task.expected_noise > 0).all():
-        raise InputError(
-            "a prediction of measurements without noise has nothing to be compared with; set noise.variance or"
-            " estimator.noise_variance to a number above 0"
-        )
     to_fit = fitted and task.prior.kind == "independent" and len(task.model.camera.sub_imagers) > 1
     prior = _fitted(task) if to_fit else None
     execution = execution or Execution()

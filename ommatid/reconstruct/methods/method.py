@@ -218,10 +218,8 @@ class EstimationTask:
 
     def window(self, rows: slice, columns: slice) -> TaskWindow:
         """Cut out a window of f with the used measurements that see nothing outside it."""
-        inside = self.model.windowed.measurements_inside(rows, columns)
-        used = self.used[inside]
-        numbers, shape = inside[used], (rows.stop - rows.start, columns.stop - columns.start)
-        index, matrix = self.among_used(numbers), self.model.windowed.submatrix(rows, columns)[used]
+        numbers, shape = self.used_inside(rows, columns), (rows.stop - rows.start, columns.stop - columns.start)
+        index, matrix = self.among_used(numbers), self.model.windowed.rows_on(numbers, rows, columns)
         return TaskWindow(matrix, self.recorded[numbers], self.expected_noise[index], index, shape)
 
     def used_inside(self, rows: slice, columns: slice) -> IntArray:
@@ -316,6 +314,30 @@ class MethodResult:
     noise_difference: float | None = None
     left_out: float | None = None
 
+    def with_error(
+        self,
+        cause: str,
+        variance: FloatArray,
+        of_sum: Callable[[FloatArray], float],
+        interval: Callable[[Interval], Interval | None],
+    ) -> MethodResult:
+        """Return the result with one more error, independent of the others.
+
+        variance : (N,) of every pixel;  of_sum : of a weighted sum of pixels;  interval : that with the error
+        """
+        expected, before, given = self.expected, self.variance_of_sum, self.interval
+        parts = expected.parts | {cause: expected.parts.get(cause, 0.0) + float(variance.mean())}
+
+        def variance_of_sum(weights: FloatArray) -> float:
+            return before(weights) + of_sum(weights)
+
+        return replace(
+            self,
+            expected=replace(expected, variance=expected.variance + variance, parts=parts),
+            interval=None if given is None else interval(given),
+            variance_of_sum=variance_of_sum,
+        )
+
 
 @dataclass(frozen=True)
 class PosteriorOperators:
@@ -329,6 +351,10 @@ class PosteriorOperators:
     posterior: Callable[[FloatArray], FloatArray]
     weigh: Callable[[FloatArray], FloatArray]
     hidden: Callable[[FloatArray], FloatArray]
+
+    def transposed_gain(self, task: EstimationTask, weights: FloatArray) -> FloatArray:
+        """Return A^T w = Rv^-1 H C w of f's pixels: (N,) to (measurements used,)."""
+        return self.weigh(task.observe(self.posterior(task.of_unknowns(weights))))
 
 
 class Method(ABC):

@@ -2,7 +2,7 @@
 
 A pixel of a tile is estimated without the measurements beyond it. Where the lens types leave a null space these matter
 over any distance, and the cost is a factor of several; where they leave none it is some percent. The cost is measured
-against a window many times as large as a tile.
+in a window three times as large as a tile.
 
 Operators of the estimate for means over the frame are those of the whole frame, which the estimate by tiles approaches
 to a few hundredths.
@@ -11,22 +11,17 @@ to a few hundredths.
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.pool import worker_pool
 from ommatid.runtime.files import digest
 from ommatid.runtime.machine import one_thread, processors
-from ommatid.runtime.streams import Purpose, probe
 
 from ..expected_error import ExpectedError, interval
-from ..frame.conjugate_gradients import (
-    frame_system,
-    mean_accuracy,
-    posterior_operators,
-)
-from ..frame.swept import whole_variances
+from ..frame.frame_method import FrameMethod
+from ..frame.variance_map import is_narrow
+from ..frame.windows import Windows
 from ..output.run_json import SolverReport
 from ..verdict.residual import ResidualInputs, ResidualPower
 from .method import (
@@ -49,8 +44,6 @@ from .tile_solver import (
     transposed_gain,
 )
 
-TILES = 3  # sides of the window, in tiles
-PIXELS = 12  # whose variances are compared
 NOTABLE = 1.1  # factor that is worth saying
 MAX_TILES = 256  # in one task
 MANY = 250_000  # pixels above which each draw takes long and few are enough
@@ -58,31 +51,20 @@ DRAWS, FEW_DRAWS = 8, 2  # of images and noise for the expected residual
 
 
 def tile_cost(task: EstimationTask, variance: FloatArray) -> float | None:
-    """Return the mean of (N,) variances of an estimate by tiles over that of the window, for pixels of its middle.
+    """Return the mean of (N,) variances of an estimate by tiles over that in the middle of a window of three tiles.
 
-    The whole frame would make it a little larger. None for pixels that are correlated in the prior, for
-    measurements without noise, and where the frame is no larger than a tile.
+    The whole frame would make it a little larger. None for pixels that are correlated in the prior, for footprints
+    that are not sharp, for measurements without noise, and where the frame is no larger than a tile.
     """
-    size = task.tiles.size
-    if task.prior.kind != "independent" or max(task.shape) <= size or not (task.expected_noise > 0).all():
+    size, noise = task.tiles.size, task.expected_noise
+    if not is_narrow(task) or max(task.shape) <= size or not (noise > 0).all():
         return None
-    if task.model.windowed.reach > size:  # footprints as wide as a tile leave K without a band
-        return None
-    sides = [min(TILES * size, length) for length in task.shape]
-    rows, columns = (
-        slice((length - side) // 2, (length + side) // 2) for length, side in zip(task.shape, sides, strict=True)
-    )
-    window = task.window(rows, columns)
-    matrix, shape = window.matrix, window.shape
-    information = matrix.T @ sparse.csr_array(matrix.multiply((1 / window.expected_noise)[:, None]))
-    precision = sparse.csr_array(information + sparse.eye_array(matrix.shape[1], format="csr") / task.prior.variance)
-    exact = whole_variances(precision, shape, task.model.windowed.reach - 1)
-    rng = probe(Purpose.TILE_COST)
-    down, across = (
-        rng.integers((length - min(size, length)) // 2, (length + min(size, length)) // 2, PIXELS) for length in shape
-    )
-    tiled = variance.reshape(task.shape)[down + rows.start, across + columns.start]
-    return float(tiled.mean() / exact[down, across].mean())
+    windows = Windows(task, noise, (size, size), halo=size, beside=task.prior.variance)
+    row, column = ((length - side) // 2 for length, side in zip(task.shape, windows.shape, strict=True))
+    core = [slice((side - min(size, side)) // 2, (side + min(size, side)) // 2) for side in windows.shape]
+    exact, *_ = windows.map(task.model.windowed, (row, column), tuple(core))
+    tiled = variance.reshape(task.shape)[row + core[0].start :, column + core[1].start :]
+    return float(tiled[: exact.shape[0], : exact.shape[1]].mean() / exact.mean())
 
 
 def words(cost: float | None) -> str:
@@ -118,16 +100,8 @@ class TileMethod(Method):
 
     def operators(self) -> PosteriorOperators | None:
         """Return the operators of the whole frame, None where a measurement has no noise."""
-        task = self.task
-        if not (task.expected_noise > 0).all():
-            return None
-        system = frame_system(task)
-        return posterior_operators(
-            system,
-            task,
-            lambda right: system.solve(right, mean_accuracy(task)).image,
-            lambda weights: system.solve_weights(weights, mean_accuracy(task)),
-        )
+        noisy = (self.task.expected_noise > 0).all()
+        return FrameMethod(self.task, self.execution, little_memory=True).operators() if noisy else None
 
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error for the actual noise."""

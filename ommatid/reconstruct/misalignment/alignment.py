@@ -17,7 +17,7 @@ covariance of f^ over the misalignments.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -94,7 +94,7 @@ def align(
         residual = weights * (recorded - matrix @ prior.mean + changes @ scores)
         mean = joint @ np.concatenate([prior.apply_root_transposed(matrix.T @ residual), changes.T @ residual])
         pixels, step = joint[: prior.dimension, : prior.dimension], mean[prior.dimension :] - scores
-        image, variance = prior.mean + prior.apply_root(mean[: prior.dimension]), _variance(pixels, prior)
+        image, variance = prior.mean + prior.apply_root(mean[: prior.dimension]), prior.variance_of(pixels)
         narrower = np.clip(np.sqrt(np.diagonal(joint)[prior.dimension :]), MIN_STEP, 1.0)
         settled = (np.abs(step) <= CONVERGED * narrower) & (narrower > NARROWING * deviation)
         scores, deviation = scores + min(1.0, WHOLE_STEPS / (iteration + 1)) * step, narrower
@@ -175,13 +175,6 @@ def _posterior(matrix: sparse.csr_array, changes: FloatArray, weights: FloatArra
     return factorise_positive(inner)[0].inverse()
 
 
-def _variance(pixels: FloatArray, prior: Prior) -> FloatArray:
-    """Return the variance of every pixel, (N,), from the covariance of u."""
-    if prior.independent:
-        return prior.variance * np.diagonal(pixels)
-    return np.einsum("ij,ij->i", prior.root @ pixels, prior.root)
-
-
 class AlignedMethod(DenseMethod):
     """H is that of the misalignments which are most likely given the stack."""
 
@@ -207,25 +200,9 @@ class AlignedMethod(DenseMethod):
     def result_for_assumed_prior(self, noise: dict[str, FloatArray], truth: FloatArray | None) -> MethodResult:
         """Return the estimate and its error with the given noise; the remaining uncertainty of the fit adds to it."""
         result, alignment = super().result_for_assumed_prior(noise, truth), self.alignment
-        added, expected = float(alignment.variance.mean()), result.expected
+        added = float(alignment.variance.sum())
 
-        def variance_of_sum(weights: FloatArray) -> float:
-            return result.variance_of_sum(weights) + alignment.variance_of_sum(weights)
+        def wider(without: Interval) -> Interval:  # few numbers cause it: it may be almost zero or several times that
+            return without.with_added(added, added**2, alignment.variance.size)
 
-        return replace(
-            result,
-            expected=replace(
-                expected,
-                variance=expected.variance + alignment.variance,
-                parts={**expected.parts, CAUSE: added},
-                leverage=None,
-            ),
-            interval=None if result.interval is None else _wider(result.interval, added),
-            variance_of_sum=variance_of_sum,
-        )
-
-
-def _wider(interval: Interval, added: float) -> Interval:
-    """Return an interval with one more error of mean square `added`, which may be almost zero or several times that."""
-    mean = interval.mse + added
-    return Interval(mean, interval.low, interval.high * mean / interval.mse)
+        return result.with_error(CAUSE, alignment.variance, alignment.variance_of_sum, wider)

@@ -169,23 +169,22 @@ def with_attenuation(
     average = attenuation.effect(image + unseen, method.mean)
     given = None if truth is None else attenuation.effect(truth, method.mean)
     first, second = (task.of_f(half) for half in average.halves)
-    before, power = result.variance_of_sum, result.residual_power
+    power = result.residual_power
 
-    def variance_of_sum(weights: FloatArray) -> float:
-        return before(weights) + max(float((weights @ first) * (weights @ second)), 0.0)
+    def of_sum(weights: FloatArray) -> float:
+        return max(float((weights @ first) * (weights @ second)), 0.0)
+
+    def shifted(without: Interval) -> Interval:
+        return without if given is None else _shifted(without, result.expected, given, method, operators, actual)
 
     if power is not None:
         change = None if given is None else attenuation.residual_change(task, given)
         power = _with_change(power, attenuation.residual_change(task, average), change)
-    expected = _with_added(result.expected, max(average.added(task), 0.0), first + second, task.shape_of_f)
+    variance = _spread(max(average.added(task), 0.0), first + second, task.shape_of_f)
     second_order = max(attenuation.strength(sum(average.halves, np.zeros_like(unseen))), 0.0)
-    return replace(
-        result,
-        expected=replace(expected, second_order=second_order),
-        interval=result.interval if given is None else _shifted(result, given, method, operators, actual),
-        variance_of_sum=variance_of_sum,
-        residual_power=power,
-    )
+    added = result.with_error("calibration", variance, of_sum, shifted)
+    expected = replace(added.expected, attenuation=float(variance.mean()), second_order=second_order)
+    return replace(added, expected=expected, residual_power=power)
 
 
 def _with_change(power: ResidualPower, average: FloatArray, given: FloatArray | None) -> ResidualPower:
@@ -198,24 +197,23 @@ def _with_change(power: ResidualPower, average: FloatArray, given: FloatArray | 
     return replace(power, prior=changed(power.prior, average), noise=noise)
 
 
-def _with_added(expected: ExpectedError, added: float, shape: FloatArray, size: tuple[int, int]) -> ExpectedError:
-    """Return Eq. 5 with a sum of squares added where `shape` is large, (N,)."""
+def _spread(total: float, shape: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """Return squares of this sum that are large where `shape` is, (N,)."""
     squares = ndimage.uniform_filter(np.square(shape).reshape(size), NEIGHBOURHOOD, mode="nearest").ravel()
-    total, mean = float(squares.sum()), added / shape.size
-    if not total:
-        return replace(expected, attenuation=0.0)
-    parts = expected.parts | {"calibration": expected.parts.get("calibration", 0.0) + mean}
-    return replace(expected, variance=expected.variance + squares * (added / total), parts=parts, attenuation=mean)
+    return squares * (total / (float(squares.sum()) or 1.0))
 
 
 def _shifted(
-    result: MethodResult, effect: Effect, method: Method, operators: PosteriorOperators, actual: FloatArray
-) -> Interval | None:
+    without: Interval,
+    expected: ExpectedError,
+    effect: Effect,
+    method: Method,
+    operators: PosteriorOperators,
+    actual: FloatArray,
+) -> Interval:
     """Return the interval with the attenuation of the true image: its square, and its product with the noise."""
-    without, count, task = result.interval, result.image.size, method.task
-    if without is None:
-        return None
+    count, task = expected.variance.size, method.task
     mean = task.of_f(effect.halves[0] + effect.halves[1]) / 2
-    along, added = operators.weigh(task.observe(operators.posterior(task.of_unknowns(mean)))), effect.added(task)
-    unknown = UNCERTAINTY * (added + count * result.expected.parts.get("calibration", 0.0))
+    along, added = operators.transposed_gain(task, mean), effect.added(task)
+    unknown = UNCERTAINTY * (added + count * expected.parts.get("calibration", 0.0))
     return without.with_added(added, 4 * float(actual @ np.square(along)) + unknown**2, count)

@@ -22,7 +22,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.fitted.fitted_matrix import Directions
 
-from ..expected_error import ExpectedError, Interval
+from ..expected_error import Interval
 from ..methods.method import EstimationTask, Method, MethodResult, PosteriorOperators
 from ..prior import spectrum_of
 from ..verdict.residual import ResidualPower, SharedResidual, squared_trace
@@ -54,11 +54,18 @@ class SharedErrors:
         """Diagonal of K, (N,)."""
         return np.square(self.images).sum(axis=0)
 
+    def map(self, shape: tuple[int, int]) -> FloatArray:
+        """Return the diagonal of K, (N,), averaged over neighbours where few combinations stand for all columns."""
+        if self.exact:
+            return self.variance
+        smooth = ndimage.uniform_filter(self.variance.reshape(shape), NEIGHBOURHOOD, mode="nearest").ravel()
+        return smooth * (float(self.variance.mean()) / (float(smooth.mean()) or 1.0))
+
     def variance_of_sum(self, weights: FloatArray, task: EstimationTask, operators: PosteriorOperators) -> float:
         """Return w^T K w of (N,) weights."""
         if self.exact or self.directions is None:
             return float(np.square(self.images @ weights).sum())
-        back = operators.weigh(task.observe(operators.posterior(task.of_unknowns(weights))))
+        back = operators.transposed_gain(task, weights)
         return float(np.square(self.directions.adjoint(task.on_all_measurements(back, 0.0))).sum())
 
     def whitened(self, task: EstimationTask) -> SharedResidual:
@@ -75,10 +82,7 @@ class SharedErrors:
         if len(combined) > CROSS_DRAWS:
             weights = probe(Purpose.SHARED_PRODUCTS).normal(size=(CROSS_DRAWS, len(combined)))
             combined = weights @ combined / CROSS_DRAWS**0.5
-        across = sum(
-            float(actual @ np.square(operators.weigh(task.observe(operators.posterior(task.of_unknowns(image))))))
-            for image in combined
-        )
+        across = sum(float(actual @ np.square(operators.transposed_gain(task, image))) for image in combined)
         return 4 * along + 2 * squared_trace(self.images @ self.images.T, self.exact) + 4 * across
 
 
@@ -182,28 +186,15 @@ def _added(
     cause: str,
 ) -> MethodResult:
     """Return a result with errors for its image, and in the interval those `given` the true one."""
-    task, before = method.task, result.variance_of_sum
+    task = method.task
 
-    def variance_of_sum(weights: FloatArray) -> float:
-        return before(weights) + errors.variance_of_sum(weights, task, operators)
+    def of_sum(weights: FloatArray) -> float:
+        return errors.variance_of_sum(weights, task, operators)
 
-    return replace(
-        result,
-        expected=_with_variance(result.expected, errors, task.shape_of_f, cause),
-        interval=None
-        if result.interval is None or truth is None
-        else _wider(result.interval, given, truth, actual, method, operators),
-        variance_of_sum=variance_of_sum,
-    )
+    def wider(without: Interval) -> Interval | None:
+        return None if truth is None else _wider(without, given, truth, actual, method, operators)
 
-
-def _with_variance(expected: ExpectedError, errors: SharedErrors, size: tuple[int, int], cause: str) -> ExpectedError:
-    variance, mean = errors.variance, float(errors.variance.mean())
-    if not errors.exact:
-        smooth = ndimage.uniform_filter(variance.reshape(size), NEIGHBOURHOOD, mode="nearest").ravel()
-        variance = smooth * (mean / (float(smooth.mean()) or 1.0))
-    parts = expected.parts | {cause: expected.parts.get(cause, 0.0) + mean}
-    return replace(expected, variance=expected.variance + variance, parts=parts)
+    return result.with_error(cause, errors.map(task.shape_of_f), of_sum, wider)
 
 
 def _wider(

@@ -220,19 +220,23 @@ def residual_parts(residual: WhitenedResidual, camera: Camera) -> list[ResidualP
 
     Lens types are left out where there is one, and sub-imagers where each is a lens type.
     """
-    sums = _Sums(residual, camera)
-    parts = sums.parts("all", ["all"], sums.slices_of((camera.slices()[0].start,)))
+    used, subs = residual.used, _numbered(camera.slices())
+    sums = _Sums(residual, _Parts.of(subs, used, len(camera.sub_imagers)))
+    found = sums.parts("all", ["all"], _Parts.of(np.zeros_like(subs), used, 1))
     if len(camera.types) > 1:
-        starts = [part.start for part in camera.type_slices()]
-        parts += sums.parts("lens type", [lens_type.name for lens_type in camera.types], sums.slices_of(starts))
+        names = [lens_type.name for lens_type in camera.types]
+        found += sums.parts("lens type", names, _Parts.of(_numbered(camera.type_slices()), used, len(names)))
     if len(camera.sub_imagers) > len(camera.types):
-        parts += sums.parts("sub-imager", [sub.name for sub in camera.sub_imagers], sums.subs)
+        found += sums.parts("sub-imager", [sub.name for sub in camera.sub_imagers], sums.subs)
     if camera.measurements >= LEAST_IN_REGION * REGIONS**2:
         names = [name for row in PLACES for name in row]
-        labels = regions(camera)
-        used = labels if residual.used.all() else labels[residual.used]
-        parts += sums.parts("region", names, _Scattered(used, len(names)))
-    return parts
+        found += sums.parts("region", names, _Parts.of(regions(camera), used, len(names)))
+    return found
+
+
+def _numbered(slices: Sequence[slice]) -> NDArray[np.uint32]:
+    """Return the number of the slice in which each measurement lies: (M,)."""
+    return np.repeat(np.arange(len(slices), dtype=np.uint32), [part.stop - part.start for part in slices])
 
 
 @lru_cache(maxsize=1)  # for the next frame of the same camera
@@ -250,11 +254,16 @@ def regions(camera: Camera) -> NDArray[np.uint8]:
 
 
 @dataclass(frozen=True)
-class _Scattered:
+class _Parts:
     """Parts of the measurements used, by the index of the part of each: (measurements used,)."""
 
     labels: NDArray[np.integer]
     count: int
+
+    @classmethod
+    def of(cls, labels: NDArray[np.integer], used: BoolArray, count: int) -> _Parts:
+        """Return the parts by the index of each of all measurements, (M,)."""
+        return cls(labels if used.all() else labels[used], count)
 
     def sums(self, values: FloatArray | Float32Array) -> FloatArray:
         """Return the sum of the values of each part: (count,)."""
@@ -267,46 +276,13 @@ class _Scattered:
 
 
 @dataclass(frozen=True)
-class _Contiguous:
-    """Parts that lie one after the other in the order of measurements; `sizes` of them, (count,), may be 0."""
-
-    sizes: IntArray
-
-    @property
-    def count(self) -> int:
-        """Number of parts."""
-        return self.sizes.size
-
-    def sums(self, values: FloatArray | Float32Array) -> FloatArray:
-        """Return the sum of the values of each part: (count,)."""
-        if values.strides == (0,):
-            return self.sizes * np.float64(values[0] if values.size else 0.0)
-        total, some = np.zeros(self.count), self.sizes > 0
-        if some.any():
-            total[some] = np.add.reduceat(values, (np.cumsum(self.sizes) - self.sizes)[some], dtype=np.float64)
-        return total
-
-    @property
-    def labels(self) -> IntArray:
-        """Index of the part of each measurement: (measurements used,)."""
-        return np.repeat(np.arange(self.count), self.sizes)
-
-
 class _Sums:
-    """Sums over the measurements of any part."""
+    """Sums over the measurements of any part; subs : by sub-imager."""
 
-    def __init__(self, residual: WhitenedResidual, camera: Camera) -> None:
-        self.residual = residual
-        self.subs = self.slices_of([part.start for part in camera.slices()])
+    residual: WhitenedResidual
+    subs: _Parts
 
-    def slices_of(self, starts: Sequence[int]) -> _Contiguous:
-        """Return the parts of the measurements that begin at these ones, of all."""
-        used = self.residual.used
-        if used.all():
-            return _Contiguous(np.diff([*starts, used.size]))
-        return _Contiguous(np.add.reduceat(used.astype(np.intp), starts))
-
-    def parts(self, kind: str, names: list[str], of: _Scattered | _Contiguous) -> list[ResidualPart]:
+    def parts(self, kind: str, names: list[str], of: _Parts) -> list[ResidualPart]:
         """Return the parts with these names."""
         residual, power = self.residual, self.residual.power
         sizes = of.sizes
@@ -340,7 +316,7 @@ class _Sums:
             if sizes[number]
         ]
 
-    def _variance(self, power: FloatArray, of: _Scattered | _Contiguous, sums: FloatArray) -> FloatArray:
+    def _variance(self, power: FloatArray, of: _Parts, sums: FloatArray) -> FloatArray:
         """Return the variance of the sums of squares with these means, and `sums` of them."""
         residual = self.residual
         variance = 2 * residual.largest * sums
@@ -348,14 +324,12 @@ class _Sums:
             variance += 3 * of.sums(_scaled(np.square(power), residual.spread))
         if residual.shared.any():
             subs = self.subs.count
-            both = _Scattered(self.subs.labels + subs * of.labels.astype(np.intp), subs * of.count)
+            both = _Parts(self.subs.labels + subs * of.labels.astype(np.intp), subs * of.count)
             shared = both.sums(residual.shared * power).reshape(of.count, subs)
             variance += 2 / SHARED_FREEDOMS * np.square(shared).sum(axis=1)
         return variance
 
-    def _variance_of_shared(
-        self, shared: SharedResidual, of: _Scattered | _Contiguous, bias: FloatArray | float = 0.0
-    ) -> FloatArray:
+    def _variance_of_shared(self, shared: SharedResidual, of: _Parts, bias: FloatArray | float = 0.0) -> FloatArray:
         """Return what errors with the covariance W, of few degrees of freedom, add to the variance of the sums.
 
         That is 2 tr W^2 and the products with the noise, 4 tr(W W'), and with the certain part, 4 b^T W b; half of the
@@ -365,7 +339,7 @@ class _Sums:
         products = self.residual.largest * of.sums(shared.power)
         return 2 * squared + 2 * products + 4 * bias * np.sqrt(squared)
 
-    def _variance_of_samples(self, samples: Float32Array, of: _Scattered | _Contiguous) -> FloatArray:
+    def _variance_of_samples(self, samples: Float32Array, of: _Parts) -> FloatArray:
         """Return 2 tr W^2 of each part from pairs of draws, with a margin since they are few."""
         pairs = list(combinations(samples, 2))
         squares = sum((np.square(of.sums(one * other)) for one, other in pairs), np.zeros(of.count))

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
-import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from ommatid.runtime.arrays import BoolArray
 from ommatid.scenes.camera import Camera
 
-from ..expected_error import COVERAGE, Interval
+from ..expected_error import Interval
 from ..noise import DITHER
 from ..output.run_json import ResidualPart, VerdictReport
 from .causes import MOST_NAMED, listed, named
@@ -31,7 +29,6 @@ UNCERTAIN = ": the uncertainty of H is more than a small correction; "
 APART = 1.5  # ratio of the RMS error to expect for a picture to the stated one, from which its error bars are doubtful
 PEAKED, POINTS = 7.0, 20.0  # kurtosis of an estimate from which it is worth a note, and a doubt
 LEAST_HIDDEN = 0.3  # share of the prior's part in the error, below which the picture's contrast hardly matters to it
-SHAPES = (0.0, 25.0)  # logarithms of the least and largest shape of a gamma variate of an error
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 
 
@@ -234,23 +231,10 @@ def _judge_rounding(check: ErrorCheck, findings: _Findings) -> None:
 def error_p_value(mse: float, interval: Interval) -> float:
     """Return the probability of an error this far on its side of the expected one, as a gamma variate."""
     above = mse > interval.mse
-    if interval.variance > 0:
-        return _tail(interval.mse**2 / interval.variance, mse / interval.mse, above)
-    if not interval.low < interval.mse < interval.high:
+    if not interval.variance > 0:
         return float(mse == interval.mse)
-    level, end = (COVERAGE[1], interval.high) if above else (COVERAGE[0], interval.low)
-
-    def difference(logarithm: float) -> float:
-        shape = float(np.exp(logarithm))
-        return float(special.gammaincinv(shape, level)) / shape - end / interval.mse
-
-    shape = float(np.exp(cast(Any, optimize).brentq(difference, *SHAPES)))
-    return _tail(shape, mse / interval.mse, above)
-
-
-def _tail(shape: float, ratio: float, above: bool) -> float:
-    """Return the probability of a gamma variate of mean 1 beyond `ratio`."""
-    return float(special.gammaincc(shape, shape * ratio) if above else special.gammainc(shape, shape * ratio))
+    shape, scaled = interval.mse**2 / interval.variance, mse * interval.mse / interval.variance
+    return float(special.gammaincc(shape, scaled) if above else special.gammainc(shape, scaled))
 
 
 def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:

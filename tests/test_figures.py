@@ -61,6 +61,7 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/lenses.md", "Walls"): "worlds with 16384 samples, an hour",
     ("docs/lenses.md", "Misalignment"): "constants of the text",
     ("docs/noise.md", "Light"): "constants of the text",
+    ("docs/paper.md", "Claims"): "statements, which test_paper.py compares with claims.csv",
     ("docs/paper.md", "Assumptions"): "constants of the text",
     ("docs/pictures.md", "Values"): "constants of the text",
     ("docs/priors.md", "Priors"): "constants of the text",

@@ -29,7 +29,7 @@ from .frames import Frame, FrameOptions
 
 FILM = "film.gif"
 VERSION = 1  # of the drawing: another one draws films anew
-MOST_FRAMES = 100
+MOST_FRAMES = 60
 MOST_PIXELS = 12_000_000  # of all panels of all frames: some 9 MB of a photograph
 LARGEST, SMALLEST = 480, 300  # rows and columns of a panel: means above, squares of equal pixels below
 GAP, TITLE, FOOT, TEXT = 8, 20, 44, 12  # pixels: around panels, above and below them, height of letters

@@ -10,8 +10,10 @@ import typer
 from . import options, output
 from .options import Changes, Folder, Formats, Json, SceneFile, Within
 
-Photograph = Annotated[str, typer.Option("--image", metavar="FILE", help="The photograph of Figure 7, or photo:NAME.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the noise in Figure 7.")]
+Photograph = Annotated[
+    str, typer.Option("--image", metavar="FILE", help="Photograph of Figures 6 and 7, or photo:NAME.")
+]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the noise in Figures 6 and 7.")]
 Which = Annotated[
     Literal["lens-diversity", "multiscale"],
     typer.Option("--which", help="Wood, Rajan and Christensen, or Fu, Litterio, Felzenszwalb and Zia."),
@@ -39,7 +41,7 @@ def paper(
     figures = options.figure_files(formats)
     with output.progress_bar("paper") as progress:
         description = write_paper(folder, image, seed, progress, figures)
-    output.print_result(description, [(f"The paper's claims: {folder / 'claims.csv'}", rows(description))], as_json)
+    output.print_result(description, [(f"The paper's claims: {folder / 'index.html'}", rows(description))], as_json)
 
 
 def stability(

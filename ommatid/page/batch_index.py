@@ -97,7 +97,7 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     drawn = SWEEP_PICTURE if picture.is_file() else ""
     stamp = fingerprint([described, [row.flat() for row in sweep], drawn, sources_digest()])
     name = real_path(output).name
-    content = {"sweep": sweep, "sweep_picture": drawn, "title": f"Batch: {name}"}
+    content: dict[str, Any] = {"sweep": sweep, "sweep_picture": drawn, "title": f"Batch: {name}"}
     return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, stamp, **content), write_text)[1]
 
 
@@ -110,7 +110,7 @@ def write_film_index(output: Path, reports: Sequence[tuple[str, RunReport | None
         BatchEntry(name, report, failure, page=quote(f"{name}.png"), picture=quote(f"{name}.png"))
         for name, report, failure in reports
     ]
-    content = {"film": film, "title": f"Film: {real_path(output).name}", "noun": "frames"}
+    content: dict[str, Any] = {"film": film, "title": f"Film: {real_path(output).name}", "noun": "frames"}
     write_text(output / INDEX, page(entries, fingerprint([name for name, *_ in reports]), **content))
     return output / INDEX
 

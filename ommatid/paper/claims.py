@@ -1,4 +1,4 @@
-"""The claims of the paper (Wood, Rajan and Christensen), and our formulas of null spaces, checked.
+"""The claims of the paper (Wood, Rajan and Christensen), in words of this program, and claims of its own, checked.
 
 Errors are expected squared errors per pixel (Eq. 5) in squared units of f; noise means its variance. Unless stated
 otherwise the estimator expects the actual noise. Claims on photographs are checked by simulated reconstructions.
@@ -6,6 +6,7 @@ otherwise the estimator expects the actual noise. Claims on photographs are chec
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import inf, isfinite
@@ -39,6 +40,7 @@ from .tile_errors import (
 
 YES, NO, QUALIFIED = "yes", "no", "with qualifications"
 PAPER, OWN = "paper", "ommatid"  # sources of claims
+CLAIMS, CLAIM_COLUMNS = "claims.csv", ("claim", "source", "figure", "holds", "numbers", "remark")
 SAME = 1.1  # ratio of curves that cannot be distinguished on axes of eight decades
 ABOUT_TEN = (8.0, 12.5)  # "about 10 times"
 ORDER_OF_TEN = 3.0  # the least ratio of the order of magnitude of ten
@@ -50,7 +52,9 @@ LOUD, QUIET = 1.0, 0.1  # noise variances that the claims name
 class Claim:
     """A statement, the verdict (yes, no, with qualifications), its numbers, and the qualification.
 
-    source : of the statement: the paper, or this program, which generalises the paper's ranks of H to formulas
+    source : of the statement: the paper, or this program, which generalises the paper's ranks of H to formulas, and its
+        comparison of trimmed tiles to the 35 x 35 tile
+    figure : the figure that shows it, by the name of its file; empty without one
     """
 
     claim: str
@@ -58,6 +62,18 @@ class Claim:
     numbers: dict[str, float]
     remark: str = ""
     source: str = PAPER
+    figure: str = ""
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """The claim as a row of claims.csv, whose columns are CLAIM_COLUMNS."""
+        numbers = "; ".join(f"{name}: {number:.9g}" for name, number in self.numbers.items())
+        return self.claim, self.source, self.figure, self.holds, numbers, self.remark
+
+
+def shown_in(figure: str, claims: Iterable[Claim]) -> list[Claim]:
+    """Return claims with the figure that shows them."""
+    return [replace(claim, figure=figure) for claim in claims]
 
 
 def verdict(holds: bool, qualified: bool = False) -> str:
@@ -66,14 +82,19 @@ def verdict(holds: bool, qualified: bool = False) -> str:
 
 
 def error_claims(tiles: Tiles) -> list[Claim]:
-    """Check the claims on expected errors (Fig. 2 to 5)."""
-    checks = (_one_type, _two_types, _null_space, _three_types, _edges, _trimming, _larger_tile, _longer_lenses)
-    return [check(tiles) for check in checks]
+    """Check the claims on expected errors, by the figures that show them."""
+    return [
+        *shown_in("fig2", [check(tiles) for check in (_one_type, _two_types, _null_space, _three_types, _second_set)]),
+        *shown_in("fig3", [_edges(tiles), _trimming(tiles), _relative_trimming(tiles, 19)]),
+        *shown_in("fig4", [_larger_tile(tiles), _larger_tile_and_null_space(tiles), _relative_trimming(tiles, 35)]),
+        *shown_in("fig5", [_longer_lenses(tiles)]),
+        *shown_in("tile_sizes", [_joined(tiles)]),
+    ]
 
 
 def rank_claims() -> list[Claim]:
     """Check the claims on the null space of H."""
-    return [_one_rank(), _two_ranks()]
+    return shown_in("fig1", [_one_rank(), _two_ranks()])
 
 
 def _one_type(tiles: Tiles) -> Claim:
@@ -262,12 +283,6 @@ EQUAL = 1e-9  # relative difference of errors that two methods compute in float6
 JOINED_SIDE, PARTS = 35, 2  # of the tile that is cut into parts, and parts along either axis
 
 
-def tile_claims(tiles: Tiles) -> list[Claim]:
-    """Check the claims that compare tiles and combinations of lens types."""
-    trimming = [_relative_trimming(tiles, side) for side in COMPLETE_SIDES]
-    return [*trimming, _larger_tile_and_null_space(tiles), _second_set(tiles), _joined(tiles)]
-
-
 def _relative_trimming(tiles: Tiles, side: int) -> Claim:
     errors = {lenses: tiles[side, lenses].matched(LEAST) for lenses in (TWO, THREE)}
     removed = {lenses: 1 - inner(error, side) / float(error.mean()) for lenses, error in errors.items()}
@@ -278,6 +293,7 @@ def _relative_trimming(tiles: Tiles, side: int) -> Claim:
         holds,
         {f"{'+'.join(lenses)}: share of the error that it removes": share for lenses, share in removed.items()},
         remark if holds == NO else "",
+        PAPER if side == 19 else OWN,
     )
 
 
@@ -298,15 +314,14 @@ def _second_set(tiles: Tiles) -> Claim:
     """Compare two sets of every lens type with one set at half the noise, which averaging them would leave."""
     numbers: dict[str, float] = {}
     holds = True
-    for (side, lenses), two in tiles.items():
-        if len(set(lenses)) == 1:
-            one = tile(side, lenses[:1])
-            halved = [abs(two.mse(noise) / one.mse(noise / 2) - 1) for noise in map(float, ACTUAL)]
-            holds &= max(halved) < EQUAL and one.rank == two.rank
-            numbers[f"{side}: largest relative difference from one set at half the noise"] = max(halved)
-            numbers[f"{side}: null space of one set"] = two.camera.unknowns - one.rank
-            numbers[f"{side}: null space of two"] = two.camera.unknowns - two.rank
-            numbers[f"{side}: error of two over error of one, noise {LEAST:g}"] = two.mse(LEAST) / one.mse(LEAST)
+    for side in COMPLETE_SIDES:
+        one, two = tile(side, TWICE[:1]), tiles[side, TWICE]
+        halved = [abs(two.mse(noise) / one.mse(noise / 2) - 1) for noise in map(float, ACTUAL)]
+        holds &= max(halved) < EQUAL and one.rank == two.rank
+        numbers[f"{side}: largest relative difference from one set at half the noise"] = max(halved)
+        numbers[f"{side}: null space of one set"] = two.camera.unknowns - one.rank
+        numbers[f"{side}: null space of two"] = two.camera.unknowns - two.rank
+        numbers[f"{side}: error of two over error of one, noise {LEAST:g}"] = two.mse(LEAST) / one.mse(LEAST)
     return Claim("a second equal set of lenses only averages noise", verdict(holds), numbers)
 
 
@@ -340,7 +355,7 @@ SIGMAS = 4.0  # standard errors that a ratio may be off, so that one of twenty r
 
 def photograph_claims(photograph: Photograph) -> list[Claim]:
     """Check the claims on quantisation and on photographs."""
-    return [_quantisation(photograph), _photographs(photograph)]
+    return shown_in("fig7", [_quantisation(photograph), _photographs(photograph)])
 
 
 def _quantisation(photograph: Photograph) -> Claim:

@@ -1,4 +1,4 @@
-"""The paper's Figures 2, 3, 4, 5 and 7 as plots (Wood, Rajan and Christensen).
+"""The figures of the paper (Wood, Rajan and Christensen) as plots, and two of this program: distortion, size of tiles.
 
 Errors and noise are in squared units of f, 0 to 255. Maps are upright, with pixels of the target along both axes.
 Coinciding lines are distinguished by their markers, which are at different positions.
@@ -11,14 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
+from ommatid.figures.panels import FigurePanel, FigureScale, draw_panel, show_map
+from ommatid.figures.saving import SCREEN_PNG, FigureFiles, log_ticks, new_figure, own_style
 from ommatid.reconstruct.measured_error import TRIM
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.printable import printable_label
 from ommatid.scenes.constants import WHITE
 
 from .photographs import Photograph, TileCrops, Trials
-from .tile_errors import ACTUAL, EXPECTED, THREE, PaperTile, TileError, inner
+from .tile_errors import ACTUAL, COMBINATIONS, EXPECTED, SIZES, THREE, PaperTile, TileError, Tiles, inner
 
 LENS_COLOURS = ("tab:blue", "tab:orange", "tab:green")  # of lens types
 MARKERS = ("o", "s", "^", "D")  # of expected noise variances
@@ -27,6 +28,8 @@ TILE_COLOURS = ("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#a6761d"
 MARKER_STEP = 8  # actual noise variances from marker to marker
 ERROR = "expected squared error per pixel (grey levels squared)"
 NOISE = "actual noise variance (grey levels squared)"
+GREY = FigureScale(0.0, WHITE, "gray", "grey level (0 to 255)")
+RECONSTRUCTION_NOISE = 1e-2  # variance, of Fig. 6
 EXPECTED_NOISE = "noise variance that\nthe estimator expects"
 
 
@@ -65,27 +68,21 @@ def draw_maps(path: Path, shown: list[PaperTile], noise: float, files: FigureFil
     side = shown[0].side
     for panels, trim in zip(figure.subplots(2, len(shown)), (0, TRIM), strict=True):
         for axes, tile in zip(panels, shown, strict=True):
-            _error_map(figure, axes, tile, noise, trim)
+            _error_map(axes, tile, noise, trim)
     figure.suptitle(f"Error within the {side} x {side} tile; noise variance {_power(noise)}, as the estimator expects")
     files.replace(figure, path)
 
 
-def _error_map(figure: Any, axes: Any, tile: PaperTile, noise: float, trim: int) -> None:
+def _error_map(axes: Any, tile: PaperTile, noise: float, trim: int) -> None:
     """Draw the error within a tile without its border of `trim` pixels, on its own scale."""
     first, last = trim, tile.side - trim
     error = tile.matched(noise).reshape(tile.side, tile.side)[first:last, first:last]
-    edges = (first - 0.5, last - 0.5)
-    drawn = axes.imshow(error, cmap="viridis", vmin=0.0, vmax=error.max(), extent=(*edges, *reversed(edges)))
     seen = tile.camera.types_seeing()[first:last, first:last]
     where = "" if seen.all() else " where no lens sees it"
     within = f", trimmed by {trim} pixels" if trim else ""
     title = f"{tile.name}{within}\nmaximum {error.max():.4g}{where}, average {error.mean():.4g}"
-    _axes(axes, title, "column (target pixels)", "row (target pixels)")
-    axes.grid(visible=False)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.get_major_locator().set_params(integer=True)
-    bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
-    bar.set_label("expected squared error (grey levels squared)")
+    scale = FigureScale.positive(float(error.max()), "expected squared error (grey levels squared)")
+    draw_panel(axes, FigurePanel(title, error, scale, place=(float(trim), float(trim), 1.0)))
 
 
 @own_style()
@@ -129,29 +126,84 @@ def draw_distortion(path: Path, shown: list[PaperTile], noise: float, files: Fig
     _axes(axes, "the estimator expects the actual noise", NOISE, f"average {ERROR}")
     axes.legend(fontsize=9, loc="lower right")
     maps = [tile.matched(noise) for tile in shown]
-    scale = max(error.max() for error in maps if error.max() < 100 * maps[0].max())  # common, where comparable
+    most = max(error.max() for error in maps if error.max() < 100 * maps[0].max())  # common, where comparable
     for panel, tile, error in zip(panels, shown, maps, strict=True):
-        most = max(scale, error.max())
-        drawn = panel.imshow(error.reshape(tile.side, tile.side), cmap="viridis", vmin=0.0, vmax=most)
-        _axes(panel, f"{tile.name}\naverage {error.mean():.3g}", "column (target pixels)", "row (target pixels)")
-        panel.grid(visible=False)
-        bar = figure.colorbar(drawn, ax=panel, fraction=0.046, pad=0.03)
-        bar.set_label("grey levels squared")
+        scale = FigureScale.positive(float(max(most, error.max())), "grey levels squared")
+        title = f"{tile.name}\naverage {error.mean():.4g}"
+        draw_panel(panel, FigurePanel(title, error.reshape(tile.side, tile.side), scale))
     figure.suptitle(f"Distortion as lens diversity; maps: expected squared error at noise variance {_power(noise)}")
     files.replace(figure, path)
 
 
 @own_style()
+def draw_reconstructions(
+    path: Path,
+    picture: FloatArray,
+    photograph: Photograph,
+    estimates: dict[str, FloatArray],
+    files: FigureFiles = SCREEN_PNG,
+) -> None:
+    """Draw Fig. 6: a photograph with the places of its tiles, and each tile above its estimates by name, (T, N)."""
+    from matplotlib.patches import Rectangle
+
+    figure = new_figure(14.5, 6.6, layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.5))
+    crops, rows = photograph.crops, {"tile": photograph.crops.images, **estimates}
+    side = round(crops.images.shape[1] ** 0.5)
+    whole = left.subplots()
+    show_map(whole, FigurePanel("", picture, GREY))
+    _without_ticks(whole, "0.5")
+    left.suptitle(printable_label(f"{Path(photograph.name).name}, and six tiles of {side} x {side} pixels"))
+    for (row, column), colour in zip(crops.corners, TILE_COLOURS, strict=True):
+        style: dict[str, Any] = {"fill": False, "edgecolor": colour, "linewidth": 3}
+        whole.add_patch(Rectangle((column - 0.5, row - 0.5), side, side, **style))
+    right.suptitle(f"each tile, and its estimates at noise variance {_power(RECONSTRUCTION_NOISE)}; below: their MSE")
+    for panels, (name, images) in zip(right.subplots(len(rows), len(crops.corners)), rows.items(), strict=True):
+        panels[0].set_ylabel(name)
+        for axes, image, truth, colour in zip(panels, images, crops.images, TILE_COLOURS, strict=True):
+            show_map(axes, FigurePanel("", image.reshape(side, side), GREY))
+            _without_ticks(axes, colour)
+            if name in estimates:
+                axes.set_xlabel(f"{np.mean((image - truth) ** 2):.3g}", fontsize=9)
+    files.replace(figure, path)
+
+
+def _without_ticks(axes: Any, colour: str) -> None:
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set(color=colour, linewidth=2)
+
+
+@own_style()
+def draw_tile_sizes(
+    path: Path, tiles: Tiles, frames: dict[str, float], noise: float, files: FigureFiles = SCREEN_PNG
+) -> None:
+    """Draw error and time against the side of a tile; frames : error of a whole frame by lens types."""
+    figure = new_figure(12.0, 5.4, layout="constrained")
+    errors, seconds = figure.subplots(1, 2)
+    for lenses, colour in zip(COMBINATIONS, LENS_COLOURS, strict=True):
+        shown = [tiles[side, lenses] for side in SIZES]
+        name, style = shown[0].name, {"color": colour, "marker": "o", "ms": 5}
+        errors.semilogy(SIZES, [tile.mse(noise) for tile in shown], **style)
+        errors.axhline(frames[name], color=colour, ls=":")
+        seconds.loglog(SIZES, [tile.seconds for tile in shown], label=name, **style)
+    side = "side of the tile (target pixels)"
+    title = f"noise variance {_power(noise)}; dotted: a whole frame far from its edges"
+    _axes(errors, title, side, f"average {ERROR}")
+    _axes(seconds, "time of the estimator, once per camera", side, "seconds of a processor")
+    for axis in (seconds.xaxis, seconds.yaxis):
+        log_ticks(axis)
+    seconds.legend(title="lens types", fontsize=9, title_fontsize=9)
+    figure.suptitle("Error and time against the size of the tile, where three lens types leave no null space")
+    files.replace(figure, path)
+
+
+@own_style()
 def draw_photograph(path: Path, photograph: Photograph, side: int, files: FigureFiles = SCREEN_PNG) -> None:
-    """Draw Fig. 7: measured and predicted errors of six tiles against noise and bits, the tiles above."""
-    figure = new_figure(13.0, 10.2, layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 3.2))
-    name = (
-        f"Six tiles of {Path(photograph.name).name}, {side} x {side} pixels each, reconstructed from three lens types"
-    )
-    above.suptitle(printable_label(name))
-    _thumbnails(above, photograph.crops, side)
-    panels = below.subplots(2, 2, sharex="col", sharey="row", height_ratios=(2.4, 1.0))
+    """Draw Fig. 7: measured and predicted errors of six tiles against noise and bits."""
+    figure = new_figure(13.0, 8.0, layout="constrained")
+    name = f"Six tiles of {Path(photograph.name).name}, {side} x {side} pixels each, from three lens types"
+    figure.suptitle(printable_label(name))
+    panels = figure.subplots(2, 2, sharex="col", sharey="row", height_ratios=(2.4, 1.0))
     experiments = (
         (
             photograph.noisy,
@@ -190,17 +242,6 @@ def _ratios(axes: Any, trials: Trials, levels: list[float]) -> None:
     axes.plot(levels, trials.mean / trials.predicted, color="black", lw=1.6, marker="o", ms=4)
     axes.axhline(1.0, color="red", ls="--", lw=2.0)
     axes.set_ylim(bottom=0.0)
-
-
-def _thumbnails(figure: Any, crops: TileCrops, side: int) -> None:
-    panels = figure.subplots(1, len(crops.corners))
-    for axes, image, colour, (row, column) in zip(panels, crops.images, TILE_COLOURS, crops.corners, strict=True):
-        axes.imshow(image.reshape(side, side), cmap="gray", vmin=0.0, vmax=WHITE)
-        axes.set_title(f"row {row}, column {column}", fontsize=9)
-        axes.set_xticks([])
-        axes.set_yticks([])
-        for spine in axes.spines.values():
-            spine.set(color=colour, linewidth=3)
 
 
 def _means(line: TileError, side: int, trim: int) -> FloatArray:

@@ -30,6 +30,7 @@ LAYOUTS = ((2, 3), (3, 2), (1, 6), (6, 1))  # of regions that hold a tile each
 POSITIONS = 9  # tried along either axis of a region
 VARIANCES = tuple(10.0 ** (power / 2) for power in range(-12, 5))
 BITS = tuple(range(2, 17))
+RECONSTRUCTED = 3  # the experiment of Fig. 6; those of Fig. 7 are 0 to 2
 WHOLE_BITS = 12  # from which on images of whole numbers are known to err less
 
 
@@ -129,19 +130,12 @@ def measure(tile: PaperTile, images: FloatArray, noises: tuple[NoiseTable, ...],
 
     seed, experiment : from which the noise of every level and image follows
     """
-    camera, matrix, mean = tile.camera, tile.problem.matrix, tile.problem.prior.mean
-    light: FloatArray = np.asarray(matrix @ images.T)
-    before = np.asarray(matrix @ mean)[:, None]
-
-    def recorded(image: int, level: int) -> FloatArray:
-        own = derived_seed(seed, Purpose.PAPER, experiment, level, image)
-        return expose(light[:, image], noises[level], generators(camera, own), camera.slices())
-
+    light: FloatArray = np.asarray(tile.problem.matrix @ images.T)
     rows: list[tuple[FloatArray, float, FloatArray, float, float]] = []
     for level, noise in enumerate(noises):
         variance = noise.variance + noise.quantisation_variance
-        values = np.stack([recorded(image, level) for image in range(len(images))], 1)
-        error = mean[:, None] + tile.update(values - before, variance) - images.T
+        values = _recorded(tile, light, noise, (seed, experiment, level))
+        error = tile.estimate(values, variance) - images.T
         from_noise = tile.update(values - light, variance)
         line = tile.line(variance)
         prior, predicted = float(line.prior.mean()), float(line.at(variance).mean())
@@ -149,6 +143,21 @@ def measure(tile: PaperTile, images: FloatArray, noises: tuple[NoiseTable, ...],
         rows.append((squares[0], predicted, squares[1], predicted - prior, _spread(np.sqrt(tile.squares / variance))))
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     return Trials(noises, *columns)
+
+
+def _recorded(tile: PaperTile, light: FloatArray, noise: NoiseTable, seed: tuple[int, int, int]) -> FloatArray:
+    """Return the recorded values of images, (M, T), as `light` is; seed : and numbers of experiment and level."""
+    camera = tile.camera
+    seeds = (derived_seed(seed[0], Purpose.PAPER, *seed[1:], image) for image in range(light.shape[1]))
+    rngs = (generators(camera, own) for own in seeds)
+    return np.stack([expose(each, noise, rng, camera.slices()) for each, rng in zip(light.T, rngs, strict=True)], 1)
+
+
+def reconstructed(tile: PaperTile, images: FloatArray, variance: float, seed: int) -> FloatArray:
+    """Return the estimates of (T, N) images from measurements with noise of this variance: (T, N)."""
+    light: FloatArray = np.asarray(tile.problem.matrix @ images.T)
+    values = _recorded(tile, light, NoiseTable(variance=variance), (seed, RECONSTRUCTED, 0))
+    return tile.estimate(values, variance).T
 
 
 def _spread(values: FloatArray) -> float:

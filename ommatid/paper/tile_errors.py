@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
+from time import process_time
 
 import numpy as np
 
@@ -27,9 +29,11 @@ SIDES = (19, 35, 41)
 COMPLETE_SIDES = (19, 35)  # of tiles that are computed with every combination of lens types
 TWICE, TWO, THREE = ("I", "I"), ("I", "II"), ("I", "II", "III")
 COMBINATIONS = (TWICE, TWO, THREE)
+SIZES = (11, 14, 19, 23, 29, 35)  # sides of tiles in which three types leave no null space, and so can be compared
 EXPECTED = (1e-6, 1e-4, 1e-2, 1.0)
 ACTUAL: FloatArray = np.logspace(-6, 2, 33)
 LEAST = 1e-6
+WAVES = 2000  # along either axis: finer than the lines of waves that one type hardly sees
 TRUNCATION = 4  # times eps, the longer side and the largest singular value: smaller ones are set to 0
 STRAIGHT = ("camera.lens.I.distortion=",)
 
@@ -63,6 +67,7 @@ class PaperTile:
 
     problem : for noise of variance 1;  rank : of H
     squares : (N,) s^2, 0 beyond the rank;  modes : (N, N) P0^1/2 V
+    seconds : of the processor, for the decomposition, which serves all noise and all images
     """
 
     lenses: tuple[str, ...]
@@ -71,6 +76,7 @@ class PaperTile:
     rank: int
     squares: FloatArray
     modes: FloatArray
+    seconds: float
 
     @property
     def name(self) -> str:
@@ -92,6 +98,11 @@ class PaperTile:
         """Return A (g - H f0), (N, q), of the estimator that expects this noise variance; residual : (M, q)."""
         seen = self.modes.T @ (self.problem.matrix.T @ residual)
         return self.modes @ (seen / (expected + self.squares)[:, None])
+
+    def estimate(self, recorded: FloatArray, expected: float) -> FloatArray:
+        """Return the estimates, (N, q), from recorded values, (M, q), by the estimator that expects this variance."""
+        mean = self.problem.prior.mean
+        return mean[:, None] + self.update(recorded - np.asarray(self.problem.matrix @ mean)[:, None], expected)
 
     def line(self, expected: float) -> TileError:
         """Return Eq. 5 for the estimator that expects noise of this variance."""
@@ -124,7 +135,7 @@ def distortion() -> tuple[PaperTile, PaperTile]:
 
 def decomposed(lenses: tuple[str, ...], camera: Camera) -> PaperTile:
     """Decompose H of a camera, with the paper's prior."""
-    paper = PriorTable()
+    started, paper = process_time(), PriorTable()
     prior = independent(paper.mean, paper.variance, camera.unknowns)
     problem = Problem(ideal_matrix(camera), prior, np.ones(camera.measurements))
     dense = problem.dense_matrix()
@@ -140,19 +151,36 @@ def decomposed(lenses: tuple[str, ...], camera: Camera) -> PaperTile:
     rank = int(np.sum(singular > least))
     squares = np.zeros(camera.unknowns)
     squares[:rank] = np.square(singular[:rank])
-    return PaperTile(lenses, camera, problem, rank, squares, prior.apply_root(right.T))
+    modes = prior.apply_root(right.T)
+    return PaperTile(lenses, camera, problem, rank, squares, modes, process_time() - started)
 
 
 def tiles() -> Tiles:
-    """Decompose all tiles of the figures: 19 and 35 with every combination of lens types, 41 with three."""
-    keys = [(side, lenses) for side in SIDES for lenses in COMBINATIONS if side in COMPLETE_SIDES or lenses == THREE]
+    """Decompose all tiles of the figures: those of SIZES with every combination of lens types, 41 with three."""
+    keys = [*product(SIZES, COMBINATIONS), (41, THREE)]
     return {(side, lenses): tile(side, lenses) for side, lenses in keys}
+
+
+def whole_frame(lenses: tuple[str, ...], variance: float) -> float:
+    """Return the mean error of a frame far from its edges; noise of this variance, as the estimator expects.
+
+    There a lens type of magnification 1/m takes the mean of m x m pixels at every place. It multiplies a wave of f
+    periods per pixel by sin(pi m f) / (m sin(pi f)) along either axis, and waves are estimated one by one.
+    """
+    waves = (np.arange(WAVES) + 0.5) / (2 * WAVES)
+    ratios = [int(lens_type.ratio) for lens_type in gallery(COMPLETE_SIDES[0], lenses).types]
+    powers = [np.square(np.sin(np.pi * m * waves) / (m * np.sin(np.pi * waves))) for m in ratios]
+    seen: FloatArray = np.sum([np.multiply.outer(power, power) for power in powers], axis=0)
+    return float(np.mean(1 / (1 / PriorTable().variance + seen / variance)))
 
 
 @cache
 def gallery(side: int, lenses: tuple[str, ...]) -> Camera:
-    """Return the camera of a tile of the gallery with the named lens types."""
-    return derive(scene.read(GALLERY / f"tile{side}.toml", (), lenses))
+    """Return the camera of a tile with the named lens types: that of the gallery, or of tile19 of another size."""
+    if side in SIDES:
+        return derive(scene.read(GALLERY / f"tile{side}.toml", (), lenses))
+    fitted = (f"camera.lens.{name}.pixels=fit" for name in THREE)
+    return derive(scene.read(GALLERY / "tile19.toml", (f"target.shape=[{side},{side}]", *fitted), lenses))
 
 
 def inner(error: FloatArray, side: int, trim: int = TRIM) -> float:

@@ -28,7 +28,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("known")
     write_film(folder, SHAPE, COUNT)
     truth = np.random.default_rng(0).uniform(0, 255, SHAPE).astype(np.float32)
-    write_truth(folder / "truth.exr", truth)
+    write_truth(folder / "truth.exr", truth.astype(np.float64))
     for path in folder.glob("f?.exr"):
         stack = stack_file.read(path)
         stack.record["truth"] = digest(truth)
@@ -93,7 +93,7 @@ def test_a_page_of_another_program_is_not_replaced(frames: Path, tmp_path: Path,
     assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
 
 
-@pytest.mark.parametrize("count", [2, 99, 101, 5000])
+@pytest.mark.parametrize("count", [2, 59, 61, 5000])
 @pytest.mark.parametrize("shape", [(5, 5), (30, 700), (480, 480), (4079, 4079)])
 def test_a_film_is_bounded_whatever_its_frames(count: int, shape: tuple[int, int]) -> None:
     for panels in (2, 3):

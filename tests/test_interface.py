@@ -102,7 +102,11 @@ def test_scenes_are_changed_by_texts_and_by_values() -> None:
     values = {"noise.variance": np.float64(0.01), "noise.bits": np.int64(8), "camera.lens.II.pixels": np.array([2, 2])}
     values |= {"title": "dots 1/2", "prior.level": None}
     assert ommatid.read_scene("tile19", set=values).plain() == ommatid.read_scene("tile19", set=texts).plain()
-    third = ommatid.read_scene("tile19", set={"camera.lens.I.magnification": Fraction(1, 3), "noise": {"bits": 8}})
+    fraction: dict[str, object] = {
+        "camera.lens.I.magnification": Fraction(1, 3),
+        "noise": {"bits": 8, "variance": None},
+    }
+    third = ommatid.read_scene("tile19", set=fraction)
     assert (third.camera.lens[0].magnification, third.noise) == (Fraction(1, 3), NoiseTable(bits=8))
 
 

@@ -169,7 +169,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in cast(list[Any], value)]
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in cast(dict[Any, Any], value).items()}
+        return {str(key): _plain(item) for key, item in cast(dict[Any, Any], value).items() if item is not None}
     if isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Path | Fraction):

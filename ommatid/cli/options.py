@@ -46,6 +46,9 @@ Formats = Annotated[
         help="Write figures also as svg or pdf, and the estimate as npy, tiff16 or tiff32.",
     ),
 ]
+Baselines = Annotated[
+    bool, typer.Option("--baselines", help="Compare the estimate with other methods, where the truth is known.")
+]
 Sweeps = Annotated[
     list[str] | None,
     typer.Option(

@@ -13,7 +13,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.printable import printable_sentence
 
 from . import failures, options, output
-from .options import Changes, FolderIfAny, Force, Formats, Json, Output, Printing, Processes, Strict
+from .options import Baselines, Changes, FolderIfAny, Force, Formats, Json, Output, Printing, Processes, Strict
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")  # suffixes of recorded frames
 
@@ -41,8 +41,12 @@ Estimates = Annotated[
 ]
 StackFile = Annotated[Path, typer.Argument(metavar="STACK", help="Recorded sub-images, stack.exr.")]
 ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Their observation model, model.npz.")]
-StackOrFolder = Annotated[
-    Path, typer.Argument(metavar="STACK|DIR", help="A folder of results, a folder of such folders, or a stack.")
+StackOrFolders = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="STACK|DIR [DIR]",
+        help="A folder of results, a folder of such folders, or a stack; or two folders of results to compare.",
+    ),
 ]
 Regions = Annotated[
     list[str] | None,
@@ -238,12 +242,17 @@ def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict:
     return DescribedFrame(frame, {**heading, **report.plain()}, frame_row(name, report), code, report)
 
 
-def report(path: StackOrFolder, folder: FolderIfAny = None, as_json: Json = False) -> None:
-    """Write the page of what is there: a run, a folder of runs, or a stack."""
+def report(
+    paths: StackOrFolders, folder: FolderIfAny = None, baselines: Baselines = False, as_json: Json = False
+) -> None:
+    """Write the page of what is there: a run, a folder of runs, or a stack; or of two runs side by side."""
     from ommatid.pipeline.reconstruction import report_path
 
+    if len(paths) > 1:
+        _report_two(paths, folder, baselines, as_json)
+        return
     with output.progress_bar("report") as progress:
-        outcome = report_path(path, folder, progress)
+        outcome = report_path(paths[0], folder, progress, baselines=baselines)
     output.warn_all(outcome.warnings)
     pages = [str(reported / "report.html") for reported in outcome.folders]
     index = {} if outcome.index is None else {"index": str(outcome.index)}
@@ -266,6 +275,17 @@ def figure(
     drawn = write_slide(run, file, names, part, dark)
     output.say(f"{file}: written, {', '.join(drawn)}")
     output.print_result({"file": str(file), "panels": list(drawn)}, [], as_json)
+
+
+def _report_two(paths: Sequence[Path], folder: Path | None, baselines: bool, as_json: bool) -> None:
+    """Write the page that compares two runs. Raises InputError for other numbers of them, or without a folder."""
+    from ommatid.page.comparison import write_comparison
+
+    if len(paths) != 2 or folder is None or baselines:
+        got = "--baselines" if baselines else f"{len(paths)} folders" if len(paths) != 2 else "no -o"
+        raise InputError(f"report: expected two folders of results to compare and -o DIR, got {got}")
+    page = write_comparison(paths[0], paths[1], folder)
+    output.print_json({"pages": [str(page)]}) if as_json else output.print_lines([str(page)])
 
 
 def check(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import failures, options, output
 from .options import (
+    Baselines,
     DryRun,
     Folder,
     Force,
@@ -38,6 +39,7 @@ def run(
     folder: Folder = Path("out"),
     sweep: Sweeps = None,
     within: Within = "",
+    baselines: Baselines = False,
     formats: Formats = "",
     force: Force = False,
     dry_run: DryRun = False,
@@ -60,6 +62,7 @@ def run(
         time = options.seconds(within)
         work = stages_within(time, members, STARTED, output.warn, jobs.scheduler, workers)
         check, workers = check_within, 1
+    work = stages.with_baselines(work) if baselines else work
     work = with_options(stages.with_figures(work, figures), check if force else None, others)
     table = None if jobs.job else folder
     with output.batch_bars(len(members), printing.quiet) as bars:

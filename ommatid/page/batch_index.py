@@ -36,6 +36,20 @@ from .cached import REPORT, read_stamp, sources_digest
 from .panels.charts import ChartAxis, ChartSeries, chart
 
 INDEX = "index.html"
+COLUMNS = (
+    ("scene", ""),
+    ("verdict", ""),
+    ("measurements", ""),
+    ("sensor area", "mm²"),
+    ("RMS error", "grey levels"),
+    ("MSE, measured", "grey levels²"),
+    ("MSE, predicted", "grey levels²"),
+    ("99 % interval", "of the MSE"),
+    ("PSNR", "dB"),
+    ("gain", "dB"),
+    ("SSIM", ""),
+    ("time", "s"),
+)  # with their units
 
 
 @dataclass(frozen=True)
@@ -67,6 +81,11 @@ class BatchEntry:
     def heading(self) -> str:
         """The verdict in two or three words."""
         return heading(self.report) if self.report else ""
+
+    @property
+    def level(self) -> str:
+        """The level of the verdict, empty where it is not known."""
+        return self.report.verdict.level if self.report and self.report.verdict else ""
 
     @property
     def root(self) -> float | None:
@@ -167,9 +186,15 @@ def page(
     from .document import fill
 
     of_sweep = {"sweep": sweep, "sweep_keys": list(dict.fromkeys(key for row in sweep for key in row.values))}
-    of_batch = {"entries": entries, "words": words(entries, noun), "figure": _scenes_figure(entries)}
+    of_batch = {
+        "entries": entries,
+        "columns": COLUMNS,
+        "words": words(entries, noun),
+        "figure": _scenes_figure(entries),
+    }
     of_page = {"url": url, "page_file": REPORT, "noun": noun, "document": "", "stamp": stamp}
-    return fill("index.html", {"film": None, "sweep_picture": "", **of_sweep, **of_batch, **of_page, **content})
+    empty: dict[str, Any] = {"film": None, "sweep_picture": ""}
+    return fill("index.html", {**empty, **of_sweep, **of_batch, **of_page, **content}, "index.js")
 
 
 def words(entries: list[BatchEntry], noun: str = "scenes") -> str:

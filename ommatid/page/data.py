@@ -5,7 +5,8 @@ Maps are (rows, columns) in the target's pixels, row 0 at the top; values are in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from math import ceil, sqrt
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ommatid.analysis.baselines import known_baselines
 from ommatid.reconstruct.measured_error import best_single_sub_image, enlarged
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
@@ -27,11 +29,15 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 
 MOST_PIXELS = 2**16  # of a map on a page: three such maps as float32 are a megabyte of text
+MOST_MAPS = 4  # of so many pixels; more maps are smaller
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: run.json, the stack, the model, and the maps of estimate.exr; `truth` is None if not known."""
+    """A finished run: run.json, the stack, the model, and the maps of estimate.exr; `truth` is None if not known.
+
+    others : images of the baselines by method, (rows, columns)
+    """
 
     folder: Path
     report: RunReport
@@ -40,6 +46,7 @@ class Run:
     estimate: Float32Array
     variance: Float32Array
     truth: Float32Array | None
+    others: Mapping[str, Float32Array] = field(default_factory=dict[str, Float32Array])
 
     @property
     def title(self) -> str:
@@ -58,6 +65,7 @@ class ResultMaps:
 
     deviation : posterior standard deviation of a pixel, the square root of the mean variance in a block
     single : the best single sub-image on the grid of the image, None where the truth is not known
+    others : images of other methods by name
     """
 
     rows: int
@@ -67,6 +75,7 @@ class ResultMaps:
     deviation: Float32Array | None
     truth: Float32Array | None
     single: Float32Array | None = None
+    others: Mapping[str, Float32Array] = field(default_factory=dict[str, Float32Array])
 
     @property
     def error(self) -> Float32Array | None:
@@ -95,7 +104,14 @@ def read_run(
         estimate=channels["estimate"],
         variance=channels["variance"],
         truth=channels.get("truth"),
+        others=_others(folder, report),
     )
+
+
+def _others(folder: Path, report: RunReport) -> Mapping[str, Float32Array]:
+    """Return the images of the baselines beside the single sub-image, which the page draws in any case."""
+    known = known_baselines(folder, report.fingerprint) if report.baselines else None
+    return {} if known is None else {name: image for name, image in known.images.items() if name != "single"}
 
 
 def read_parts(folder: Path) -> dict[str, Any]:
@@ -110,11 +126,15 @@ def read_parts(folder: Path) -> dict[str, Any]:
 
 
 def maps(
-    estimate: Float32Array, variance: Float32Array | None, truth: Float32Array | None, single: FloatArray | None = None
+    estimate: Float32Array,
+    variance: Float32Array | None,
+    truth: Float32Array | None,
+    single: FloatArray | None = None,
+    others: Mapping[str, Float32Array] | None = None,
 ) -> ResultMaps:
     """Return the maps of an estimate with at most MOST_PIXELS blocks (a few more with partial blocks at the edges)."""
     rows, columns = estimate.shape
-    block = max(1, ceil(sqrt(rows * columns / MOST_PIXELS)))
+    block = block_of(estimate.shape, MOST_MAPS + len(others or {}))
     return ResultMaps(
         rows=rows,
         columns=columns,
@@ -123,7 +143,14 @@ def maps(
         deviation=None if variance is None else np.sqrt(reduced(variance, block)),
         truth=None if truth is None else reduced(truth, block),
         single=None if single is None else reduced(single, block),
+        others={name: reduced(image, block) for name, image in (others or {}).items()},
     )
+
+
+def block_of(shape: tuple[int, ...], maps: int) -> int:
+    """Return the side of the blocks whose means a page of so many maps of (rows, columns) shows."""
+    most = MOST_PIXELS * MOST_MAPS / max(maps, MOST_MAPS)
+    return max(1, ceil(sqrt(shape[0] * shape[1] / most)))
 
 
 def reduced(image: NDArray[Any], block: int) -> Float32Array:

@@ -13,21 +13,23 @@ from markupsafe import Markup
 
 from ommatid.runtime.printable import printable_lines
 
+from .documentation import documentation
+
 if TYPE_CHECKING:
     from jinja2 import Environment
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def fill(template: str, content: Mapping[str, Any]) -> str:
-    """Return a template with its content, style and program.
+def fill(template: str, content: Mapping[str, Any], program: str = "page.js") -> str:
+    """Return a template with its content, style and program, the only one that its policy lets run.
 
     All text of the content is escaped, for HTML and for readers: control characters and those that reorder text are
     written as escapes.
     """
-    files = {"css": "page.css", "print_css": "print.css", "js": "page.js"}
+    files = {"css": "page.css", "print_css": "print.css", "js": program}
     trusted = {name: Markup((TEMPLATES / file).read_text(encoding="utf-8")) for name, file in files.items()}
-    digest = b64encode(sha256(f"\n{trusted['js']}\n".encode()).digest()).decode()  # of the program alone that may run
+    digest = b64encode(sha256(f"\n{trusted['js']}\n".encode()).digest()).decode()
     return printable_lines(rendered(template, {**content, **trusted, "js_digest": f"sha256-{digest}"}))
 
 
@@ -55,4 +57,5 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["code"] = code
+    environment.globals.update(documentation=documentation)
     return environment

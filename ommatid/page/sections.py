@@ -72,7 +72,7 @@ def of_run(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None) -> dic
     """Return the content of a run's page but for its sensor."""
     truth = None if run.truth is None else run.truth.astype(np.float64)
     single = shown_sub_image(run.stack, truth)
-    shown = maps(run.estimate, run.variance, run.truth, single.image)
+    shown = maps(run.estimate, run.variance, run.truth, single.image, run.others)
     model = model_of_f(run.model, run.stack.camera, PriorTable())
     window = error_window(run.stack, model, run.estimate.astype(np.float64), run.report)
     images, responses = _images(shown, single, words.numbers_beside(run.report)), _responses(model, ideal)
@@ -86,6 +86,8 @@ def of_run(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None) -> dic
         "groups": images["groups"] + responses["groups"],
         **_time(run, bench),
         **_camera(run.stack.scene, run.stack.camera),
+        "baselines": tables.baselines(run.report) if run.report.baselines else None,
+        "baseline_words": facts.baseline_words(run.report),
         "skipped": tables.skipped(run),
         "numbers": tables.numbers(run),
         "further": tables.further(run),

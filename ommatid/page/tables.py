@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ommatid.analysis import depth_error, study
 from ommatid.analysis.lens_table import lens_rows
 from ommatid.analysis.summary import describe
-from ommatid.reconstruct.output.facts import facts, samples_of, skipped_words
+from ommatid.reconstruct.output.facts import baseline_rows, facts, samples_of, skipped_words
 from ommatid.reconstruct.output.run_json import RunReport, StageReport
 from ommatid.reconstruct.output.verdict_words import is_trusted
 from ommatid.scenes.camera import Camera
@@ -19,6 +19,7 @@ from ommatid.scenes.tables import toml
 
 from .data import Run
 
+ELSEWHERE = "left out", "  from ", "MSE "  # beginnings of facts that other tables of the page show
 NBSP = "\N{NO-BREAK SPACE}"
 
 
@@ -115,7 +116,7 @@ def numbers(run: Run) -> PageTable:
     rows = [
         (fact.name.strip(), fact.words)
         for fact in facts(run.report)
-        if fact.topic is None and not fact.name.startswith(("left out", "  from "))
+        if fact.topic is None and not fact.name.startswith(ELSEWHERE)
     ]
     return PageTable("Other numbers", ("quantity", "value"), rows)
 
@@ -130,6 +131,12 @@ def further(run: Run) -> list[tuple[str, PageTable]]:
         rows = study.rows(run.report.study)
         tables.append(("Study", PageTable("The same stack with other models of H", ("H", "error"), rows)))
     return tables
+
+
+def baselines(report: RunReport) -> PageTable:
+    """Return the errors of the estimate and of the baselines, the least first."""
+    header = ("method", "mean squared error", "PSNR", "SSIM", "time")
+    return PageTable("The same stack by other methods", header, baseline_rows(report))
 
 
 def held_out(rows: Sequence[tuple[str, str]]) -> PageTable:

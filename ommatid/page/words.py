@@ -80,6 +80,9 @@ def numbers_beside(report: RunReport) -> dict[str, str]:
         numbers["estimate"] = f"{error.psnr:.1f} dB{gain}"
     if error.baseline is not None and error.baseline.psnr is not None:
         numbers["single"] = f"{error.baseline.psnr:.1f} dB"
+    for each in report.baselines:
+        if each.psnr is not None:
+            numbers[each.method] = f"{each.psnr:.1f} dB"
     return numbers
 
 

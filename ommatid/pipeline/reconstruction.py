@@ -5,12 +5,13 @@ from __future__ import annotations
 import shutil
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
+from ommatid.analysis.baselines import missing_methods
 from ommatid.analysis.study import remove_study
 from ommatid.batch.film import cached_film
 from ommatid.batch.frames import Frame, FrameOptions
@@ -39,7 +40,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables import toml
 
-from .stages import StageResults, calibrated_model, earlier_report, finish, write_page
+from .stages import StageResults, add_baselines, calibrated_model, earlier_report, finish, write_page
 
 STACK, MODEL = "stack.exr", "model.npz"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", ".json", ".html")
@@ -215,15 +216,28 @@ def finish_film(
         return write_film_index(folder, reports, film), "" if film is None else f"{film.path}, {film.words}"
 
 
-def report_path(path: Path, output: Path | None, progress: Progress) -> ReportOutcome:
+def report_path(path: Path, output: Path | None, progress: Progress, *, baselines: bool = False) -> ReportOutcome:
     """Write the page of a finished run, of a folder of runs, or of a stack.
 
     path : a folder of results; a folder of such folders; a folder with stack.exr; or a stack
     output : for a stack the folder of its results, None: a folder beside it of its name
+    baselines : True compares the estimates with other methods, too
 
     A stack is reconstructed with model.npz beside it, or without one with H as designed. A folder with nothing but a
     model or an estimate gets a page of these. Raises InputError if there is nothing to report.
     """
+    outcome = _report(path, output, progress)
+    if not baselines:
+        return outcome
+    missing = dict[str, None]()
+    for folder in outcome.folders:
+        with occupied(folder):
+            missing[missing_methods(add_baselines(folder, progress).unknowns)] = None
+    return replace(outcome, warnings=(*outcome.warnings, *filter(None, missing)))
+
+
+def _report(path: Path, output: Path | None, progress: Progress) -> ReportOutcome:
+    """Write the pages, as `report_path` does without baselines."""
     if path.is_file():
         if path.suffix.lower() != ".exr":
             raise InputError(f"{path}: expected a folder of results, or a stack, which ends in .exr")

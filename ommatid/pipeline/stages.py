@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -113,6 +113,39 @@ def write_figures(folder: Path, figures: FigureFiles) -> None:
         draw(folder / PICTURE, stack.camera, report.depth, files=figures)
 
 
+def with_baselines(stages: Stages) -> Stages:
+    """Return stages that compare the estimate with other methods, even if the results are up to date."""
+    return partial(_and_baselines, stages)
+
+
+def _and_baselines(stages: Stages, setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
+    stages(setup, folder, observer)
+    with observer.progress("baselines") as progress:
+        return add_baselines(folder, progress).plain()
+
+
+def add_baselines(folder: Path, progress: Progress) -> RunReport:
+    """Compare a finished run with other methods, and return run.json, which is written with the page if it changes.
+
+    Raises InputError where the truth is not known.
+    """
+    from ommatid.analysis.baselines import cached_baselines
+    from ommatid.batch.remote import SILENT
+    from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
+    from ommatid.scenes import model_file, stack
+
+    report, truth = run_json.read(folder), read_estimate(folder / ESTIMATE).channels.get("truth")
+    if truth is None:
+        raise InputError(f"{folder}: --baselines compares with the truth, which is not known here; leave it out")
+    files = stack.read(folder / "stack.exr"), model_file.read(folder / "model.npz")
+    found = cached_baselines(folder, report.fingerprint, *files, truth.astype("float64"), progress)
+    if found.reports != report.baselines:
+        report = report.with_changes(baselines=found.reports)
+        write_page(StageResults(report, *files, made=False, files=0.0), folder, SILENT)
+        run_json.write(folder, report)
+    return report
+
+
 def check_run(setup: Setup, folder: Path) -> None:
     """Raise InputError for what would stop a run of a scene after some work. Nothing is written."""
     from ommatid.analysis.study import check_study
@@ -168,6 +201,7 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
 def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunReport:
     """Write the page and run.json of results, and return its content. Where nothing was made, earlier times stay."""
     begun = perf_counter()
+    results = _with_known_baselines(results, folder)
     write_page(results, folder, observer)
     times = results.files, perf_counter() - begun, results.start_up
     earlier = earlier_report(folder, results.report.fingerprint)
@@ -178,6 +212,19 @@ def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunRep
     if earlier is None or report.plain() != earlier.plain():
         run_json.write(folder, report)
     return report
+
+
+def _with_known_baselines(results: StageResults, folder: Path) -> StageResults:
+    """Return results with the baselines in the folder, or remove those of other results."""
+    from ommatid.analysis.baselines import BASELINES, known_baselines
+
+    if not (folder / BASELINES).exists():
+        return results
+    known = known_baselines(folder, results.report.fingerprint)
+    if known is None:
+        (folder / BASELINES).unlink()
+        return results
+    return replace(results, report=results.report.with_changes(baselines=known.reports))
 
 
 def earlier_report(folder: Path, fingerprint: str) -> RunReport | None:

@@ -93,7 +93,7 @@ def best_single_sub_image(stack: Stack, truth: FloatArray | None) -> SingleSubIm
 
 def enlarged(camera: Camera, sub: SubImager, image: FloatArray, rows: FloatArray) -> FloatArray:
     """Interpolate a sub-image, as bright as f, at the pixels of some rows of f: (rows, columns of f)."""
-    known, columns = _without_gaps(image) / float(sub.type.light), np.arange(float(camera.columns))
+    known, columns = without_gaps(image) / float(sub.type.light), np.arange(float(camera.columns))
     if sub.rotation == 0 and sub.type.optics.distortion is None:
         down, _ = positions(camera, sub, rows, np.zeros(rows.size))
         _, across = positions(camera, sub, np.zeros(camera.columns), columns)
@@ -132,7 +132,7 @@ def _weights(positions: FloatArray, size: int) -> sparse.csr_array:
     return sparse.csr_array((values.ravel(), (rows, columns.ravel())), shape=(positions.size, size))
 
 
-def _without_gaps(image: FloatArray) -> FloatArray:
+def without_gaps(image: FloatArray) -> FloatArray:
     """Return a sub-image whose dead pixels, NaN, have the values of the nearest others; zero where all are dead."""
     dead = ~np.isfinite(image)
     if not dead.any() or dead.all():

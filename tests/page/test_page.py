@@ -162,7 +162,8 @@ def test_a_page_requests_no_other_resource(html: str) -> None:
     for tag, attributes in parsed(html).tags:
         for name in ("src", "href", "data", "action", "poster", "srcset"):
             if attributes.get(name):
-                assert str(attributes[name]).startswith(("#", "data:")), f"{tag} {name}"
+                links = ("file:",) if tag == "a" else ()
+                assert str(attributes[name]).startswith(("#", "data:", *links)), f"{tag} {name}"
     own = html.replace("http://www.w3.org/", "")  # names of SVG, which nothing is loaded from
     assert not re.findall(r"https?://|@import|url\((?!#)", own)
     assert len(html.encode()) < 1_000_000
@@ -583,10 +584,13 @@ def test_an_index_lists_results_and_failures(finished: Path, tmp_path: Path) -> 
     assert "failed: gone.toml: no such scene file" in text
     assert "3 of 4 scenes are finished" in text
     error = data.read_run(finished).report.error
-    assert f"<td>{error.mse:.4g}</td><td>{error.predicted_mse:.4g}</td>" in text
+    for value in (error.mse, error.predicted_mse):
+        assert f'<td data-value="{value}">{value:.4g}</td>' in text
     assert text.count(f"measured {error.mse:.4g}</title>") == 3
     area = run_area(finished)
-    assert f"<td>{data.read_run(finished).report.measurements}</td><td>{area:.3g}{tables.NBSP}mm²</td>" in text
+    assert f">{data.read_run(finished).report.measurements}</td>" in text
+    assert f">{area:.3g}</td>" in text
+    assert "sensor area <small>mm²</small>" in text
     assert not batch_index.cached_index(tmp_path, folders)
     assert not batch_index.cached_index(tmp_path / "nothing", folders)
 

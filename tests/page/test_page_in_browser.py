@@ -14,6 +14,8 @@ import pytest
 from playwright.sync_api import Browser, CDPSession, ConsoleMessage, Error, Locator, Page, Request, sync_playwright
 from skimage import io
 
+from ommatid.page.batch_index import BatchEntry
+from ommatid.page.batch_index import page as index_of
 from ommatid.page.data import Run
 from ommatid.page.panels import sensor
 from ommatid.page.sections import page as page_of
@@ -394,3 +396,23 @@ def test_print_is_light_and_without_tools(dark: bool, letter: Path, shown: Opene
 
 
 # --- other pages
+
+
+def test_the_table_of_a_batch_is_sorted_by_its_headings(run: Run, tmp_path: Path, shown: Opened) -> None:
+    errors = {"a": 3.0, "b": 20.0, "c": 100.0}
+    entries = [
+        BatchEntry(name, run.report.with_changes(error=run.report.error.model_copy(update={"mse": mse})))
+        for name, mse in (("b", 20.0), ("c", 100.0), ("a", 3.0))
+    ]
+    path = tmp_path / "index.html"
+    text = index_of([BatchEntry("lost", failure="no such file"), *entries], [], "", "batch", "0")
+    path.write_text(re.sub("<img[^>]*>", "", text), encoding="utf-8")
+    with shown(path, width=390) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") == 390, "the text above the table wraps"
+        heading = page.locator("th", has_text="MSE, measured")
+        names = page.locator("tbody tr th small")
+        for order, expected in (("ascending", sorted(errors)), ("descending", sorted(errors, reverse=True))):
+            heading.get_by_role("button").click()
+            assert heading.get_attribute("aria-sort") == order
+            assert names.all_inner_texts() == expected, "rows that failed come last"
+            assert "failed" in page.locator("tbody tr").last.inner_text()

@@ -16,6 +16,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from ommatid.reconstruct.output.facts import METHODS
 from ommatid.runtime.arrays import Float32Array
 from ommatid.scenes.constants import WHITE
 
@@ -84,10 +85,10 @@ def panels(maps: ResultMaps, single: str = "", numbers: dict[str, str] | None = 
     """Return the panels in order; those that need the truth only if it is known.
 
     single : title of the sub-image;  numbers : figures beside the titles, by name
+    The images of other methods come last.
     """
     beside = numbers or {}
-    image = maps.estimate if maps.truth is None else maps.truth
-    grey = ColourScale("grey", *_range(image, 0.0 if maps.truth is not None else (100 - SHOWN) / 2), UNIT)
+    grey = grey_scale([maps.estimate], sure=False) if maps.truth is None else grey_scale([maps.truth])
     pictures = {"truth": maps.truth, "single": maps.single, "estimate": maps.estimate}
     titles = {"truth": "Truth", "single": single, "estimate": "Estimate"}
     shown = [
@@ -96,17 +97,24 @@ def panels(maps: ResultMaps, single: str = "", numbers: dict[str, str] | None = 
         if picture is not None
     ]
     if maps.error is not None:
-        limit = _limit(np.abs(maps.error))
+        limit = largest([np.abs(maps.error)])
         colours = ColourScale("diverging", -limit, limit, "estimate minus truth")
         words = _error_words(maps.error, limit)
         shown.append(
             Panel("error", "Error", maps.error, colours, beside.get("error", ""), words, ("estimate", "truth"))
         )
     if maps.deviation is not None:
-        colours = ColourScale("sequential", 0.0, _limit(maps.deviation), "posterior standard deviation")
+        colours = ColourScale("sequential", 0.0, largest([maps.deviation]), "posterior standard deviation")
         words = value_words(maps.deviation)
         shown.append(Panel("deviation", "Error bar", maps.deviation, colours, beside.get("deviation", ""), words))
+    for name, picture in maps.others.items():
+        shown.append(Panel(name, _title(name), picture, grey, beside.get(name, ""), value_words(picture)))
     return shown
+
+
+def _title(method: str) -> str:
+    name = METHODS[method]
+    return f"{name[:1].upper()}{name[1:]}"
 
 
 def group(name: str, shown: list[Panel], block: int, size: tuple[int, int]) -> dict[str, Any]:
@@ -164,9 +172,16 @@ def _range(image: Float32Array, aside: float) -> tuple[float, float]:
     return (low, high) if high > low else (low - 0.5, high + 0.5)
 
 
-def _limit(image: Float32Array) -> float:
-    known = image[np.isfinite(image)]
-    return (float(np.percentile(known, SHOWN)) if known.size else 0.0) or 1.0
+def grey_scale(images: Sequence[Float32Array], sure: bool = True) -> ColourScale:
+    """Return the grey scale of images of one target; `sure` False leaves out a few values at either end."""
+    ends = [_range(image, 0.0 if sure else (100 - SHOWN) / 2) for image in images]
+    return ColourScale("grey", min(low for low, _ in ends), max(high for _, high in ends), UNIT)
+
+
+def largest(images: Sequence[Float32Array]) -> float:
+    """Return the end of a scale of magnitudes: the largest of nearly all pixels of any of the images, 1 for zeros."""
+    known = [image[np.isfinite(image)] for image in images]
+    return max((float(np.percentile(values, SHOWN)) for values in known if values.size), default=0.0) or 1.0
 
 
 def encoded(values: NDArray[Any]) -> dict[str, Any]:

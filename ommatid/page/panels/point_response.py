@@ -166,5 +166,7 @@ def words(response: PointResponse) -> str:
     if ideal is not None:
         words += f"; the ideal values are {ideal.sum():.4g} and {ideal.max():.4g}"
     if difference is not None and np.isfinite(difference).any():
-        words += f". Calibrated and ideal values differ by at most {np.nanmax(np.abs(difference)):.2g} standard errors"
+        most = float(np.nanmax(np.abs(difference)))
+        most_words = f"differ by at most {most:.2g} standard errors" if most else "are equal"
+        words += f". Calibrated and ideal values {most_words}"
     return words + "."

@@ -79,10 +79,10 @@ def edge_words(estimate: EdgeResponse, sub: tuple[Transfer, EdgeResponse] | None
     """Return the distances from 10 % to 90 % of an edge."""
     if estimate.width is None:
         return "The estimate does not follow an edge."
-    words = f"From 10 % to 90 % of an edge: {estimate.width:.2g} pixels"
+    words = f"An edge rises from 10 % to 90 % within {estimate.width:.2g} pixels"
     if sub is None or sub[1].width is None:
         return f"{words}."
-    return f"{words}, {sub[1].width:.2g} in a pixel of the single sub-image."
+    return f"{words}, and within {sub[1].width:.2g} pixels in the single sub-image."
 
 
 def _spectrum(truth: Image, estimate: Image, single: Image) -> tuple[Markup, str]:

@@ -21,6 +21,13 @@ from .verdict_words import cause, error_words, grounds, heading, is_trusted, lim
 
 UNDETERMINED = 5.0  # deviation of the logarithm of a fitted number that may be anything
 MAX_NAMES = 5  # sub-imagers named in one fact
+ALIKE = 0.01  # relative difference of two errors, below which neither is called smaller
+METHODS = {
+    "single": "best single sub-image",
+    "rearranged": "pixel rearrangement",
+    "shift_and_add": "shift-and-add",
+    "total_variation": "total variation",
+}  # of `--baselines`
 
 Topic = Literal["verdict", "error", "quality", "limit", "time", "region"]
 LINES: tuple[Topic, ...] = "error", "quality", "limit", "time"  # of a summary, below the verdict
@@ -57,6 +64,7 @@ def facts(report: RunReport) -> list[Fact]:
         *_error(report.error),
         *map(region, report.regions),
         *_quality(report),
+        *(Fact(f"MSE by {name}", mse, f"PSNR {psnr}, {time}") for name, mse, psnr, _, time in _baselines(report)),
         Fact("limit", limit(report), topic="limit"),
         *_solver(report.solver),
         *_diagnostics(report.diagnostics),
@@ -121,6 +129,50 @@ def headline(report: RunReport) -> str:
     first, *_ = on_topic(report, "error")
     gain = [fact for fact in on_topic(report, "quality") if fact.name == "gain"]
     return ", ".join(f"{fact.name} {fact.words}" for fact in (first, *gain))
+
+
+def baseline_rows(report: RunReport) -> list[tuple[str, str, str, str, str]]:
+    """Return method, mean squared error, PSNR, SSIM and time of the estimate and of the baselines, the best first."""
+    error = report.error
+    ours = _method_row("this estimate", error.mse or 0.0, error.psnr, error.ssim, report.stages["reconstruct"].seconds)
+    pairs = [(error.mse or 0.0, ours)]
+    pairs += [(each.mse, row) for each, row in zip(report.baselines, _baselines(report), strict=True)]
+    return [row for _, row in sorted(pairs, key=lambda pair: pair[0])]
+
+
+def baseline_words(report: RunReport) -> str:
+    """Return which of the baselines have smaller errors than the estimate, as sentences; empty without baselines."""
+    mse = report.error.mse
+    if mse is None or not report.baselines:
+        return ""
+    better = [each for each in report.baselines if each.mse < (1 - ALIKE) * mse]
+    alike = [each for each in report.baselines if abs(each.mse - mse) <= ALIKE * mse]
+    words = "No other method has a smaller error."
+    if better:
+        ratios = ", ".join(f"{METHODS[each.method]} ({each.mse / mse:.2g} of the estimate's)" for each in better)
+        words = f"Smaller errors than the estimate's: {ratios}."
+    if alike:
+        words += f" As large within {100 * ALIKE:.0f} %: {', '.join(METHODS[each.method] for each in alike)}."
+    if any(each.method == "total_variation" for each in report.baselines):
+        words += " The weight of total variation is the best one for this picture, chosen with the truth at hand."
+    return words
+
+
+def _baselines(report: RunReport) -> list[tuple[str, str, str, str, str]]:
+    """Return the rows of the baselines."""
+    single = report.error.baseline
+    names = {"single": f"{METHODS['single']}, {single.sub_imager}"} if single is not None else {}
+    return [
+        _method_row((METHODS | names)[each.method], each.mse, each.psnr, each.ssim, each.seconds)
+        for each in report.baselines
+    ]
+
+
+def _method_row(
+    name: str, mse: float, psnr: float | None, ssim: float | None, seconds: float
+) -> tuple[str, str, str, str, str]:
+    quality = "exact" if psnr is None else f"{psnr:.1f} dB"
+    return name, f"{mse:.4g}", quality, "" if ssim is None else f"{ssim:.4f}", f"{seconds:.2g} s"
 
 
 def samples_of(stage: StageReport) -> str:
@@ -204,7 +256,7 @@ def _error(error: ErrorReport) -> list[Fact]:
 
 def _quality(report: RunReport) -> list[Fact]:
     error, diagnostics = report.error, report.diagnostics
-    width = "nothing is resolved" if diagnostics.resolution is None else f"{diagnostics.resolution:.3g} pixels of f"
+    width = "nothing is resolved" if diagnostics.resolution is None else _pixels(diagnostics.resolution)
     freedom = f"{diagnostics.degrees_of_freedom:.4g} of {report.unknowns}"
     of_image: Topic | None = "quality" if error.mse is None else None
     found = [Fact("resolution", width, "median", of_image), Fact("degrees of freedom", freedom, topic=of_image)]
@@ -226,12 +278,12 @@ def _solver(solver: SolverReport) -> list[Fact]:
     if solver.way == "frame":
         bound = f"below {solver.bound or 0.0:.1g} posterior standard deviations in every pixel"
         found = [
-            Fact("computation, error", bound),
-            Fact("  of variances", f"{solver.variance_bound:.1g}, relative, by exact solutions for some pixels"),
+            Fact("error of the computation", bound),
+            Fact("  of the variances", f"{solver.variance_bound:.1g}, relative, by exact solutions for some pixels"),
         ]
     else:
         bounds = f"error below {solver.bound or 0.0:.0e}, of variances {solver.variance_bound:.0e}, relative"
-        found = [Fact("right digits", f"{solver.digits:.1f}", bounds)]
+        found = [Fact("correct digits", f"{solver.digits:.1f}", bounds)]
     if solver.way == "tiles":
         found.append(Fact("  in tiles", solver.why))
     return found + [Fact(f"  not by the {form.method} form", form.why_not) for form in solver.tried]
@@ -248,11 +300,23 @@ def _diagnostics(diagnostics: DiagnosticsReport) -> list[Fact]:
         expected = f"expected {residual.expected:.4g} +/- {residual.deviation:.2g}"
         found.append(Fact("chi-squared of the residual", f"{residual.chi_squared:.4g}", expected))
     for name, number in diagnostics.fit.items():
-        unit = " pixels of f" if name == "correlation_length" else ""
-        known = number.log_deviation < UNDETERMINED
-        precision = f"within a factor of {exp(number.log_deviation):.3g}" if known else "which the stack leaves open"
-        found.append(Fact(f"fitted {name.replace('_', ' ')}", f"{number.value:.4g}{unit}", precision))
+        value = _pixels(number.value) if name == "correlation_length" else f"{number.value:.4g}"
+        found.append(Fact(f"fitted {name.replace('_', ' ')}", value, _precision(number.log_deviation)))
     return found
+
+
+def _pixels(length: float) -> str:
+    return "1 pixel of f" if f"{length:.3g}" == "1" else f"{length:.3g} pixels of f"
+
+
+def _precision(log_deviation: float) -> str:
+    """Return how well a fitted number is known; empty for one that was not fitted."""
+    if log_deviation >= UNDETERMINED:
+        return "which the stack leaves open"
+    percent = f"{100 * log_deviation:.2g}"
+    if log_deviation >= 0.1:
+        return f"within a factor of {exp(log_deviation):.3g}"
+    return "" if percent == "0" else f"within {percent} %"
 
 
 def _model(model: ModelReport) -> list[Fact]:
@@ -275,6 +339,6 @@ def _time(spent: TimeReport, limits: bool) -> list[Fact]:
         chosen = ", ".join(f"{key} {value}" for key, value in spent.chosen.items())
         found.append(Fact("  of the time limit", f"{spent.seconds:.1f} s of {spent.within:g} s", chosen))
     if spent.more and limits:
-        more = ", ".join(f"{more.seconds:.3g} s: {more.predicted_mse:.4g}" for more in spent.more[:2])
-        found.append(Fact("MSE at most, in more time", more, f"by noise alone: {spent.noise_alone:.4g}"))
+        more = ", ".join(f"{more.predicted_mse:.4g} in {more.seconds:.3g} s" for more in spent.more[:2])
+        found.append(Fact("MSE with more samples", f"at most {more}", f"by noise alone {spent.noise_alone:.4g}"))
     return found

@@ -32,6 +32,7 @@ EPS = 2.0**-52  # of float64
 
 Amount = Annotated[float, Field(ge=0, le=1e100)]  # a squared error, or a time in seconds
 Index = Annotated[int, Field(ge=0, lt=2**31)]
+BaselineMethod = Literal["single", "rearranged", "shift_and_add", "total_variation"]
 
 
 def time_spent(stages: Mapping[str, StageReport], error: ErrorReport, *, calibrated: bool) -> TimeReport:
@@ -131,6 +132,20 @@ class BaselineReport(Record):
     mse: Amount
     psnr: float | None
     ssim: float | None
+
+
+class MethodReport(Record):
+    """Error of a baseline of `--baselines` against the truth, and its seconds.
+
+    weight : of total variation, per grey level, the one of least error
+    """
+
+    method: BaselineMethod
+    mse: Amount
+    psnr: float | None
+    ssim: float | None
+    seconds: Amount
+    weight: float | None = None
 
 
 class ErrorReport(Record):
@@ -485,6 +500,7 @@ class RunReport(Record):
     regions: tuple[RegionReport, ...] = ()
     depth: tuple[DepthBin, ...] = ()
     study: tuple[StudyCase, ...] = ()
+    baselines: tuple[MethodReport, ...] = ()
 
     def __repr__(self) -> str:
         """Return title, size and error in one line."""

@@ -29,6 +29,7 @@ UNCERTAIN = ": the uncertainty of H is more than a small correction; "
 APART = 1.5  # ratio of the RMS error to expect for a picture to the stated one, from which its error bars are doubtful
 PEAKED, POINTS = 7.0, 20.0  # kurtosis of an estimate from which it is worth a note, and a doubt
 LEAST_HIDDEN = 0.3  # share of the prior's part in the error, below which the picture's contrast hardly matters to it
+LEAST_LOSS = 0.05  # dB below the best single sub-image, which round to 0.1
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 
 
@@ -121,7 +122,7 @@ def with_gain(verdict: VerdictReport, gain: float | None, prior: str) -> Verdict
 
     prior : its kind
     """
-    if gain is None or gain >= 0:
+    if gain is None or gain > -LEAST_LOSS:
         return verdict
     remedy = "less noise, more sub-imagers or other lens types help" if prior == "fit" else "set prior.kind to 'fit'"
     words = f"the estimate is {-gain:.1f} dB worse than the best single sub-image, enlarged; {remedy}"
@@ -149,15 +150,25 @@ def _judge_residual(
     if beyond:
         findings.reasons.append(f"{_excess_words(whole, beyond)}: {cause(beyond)}")
         return
-    findings.passed.append(f"the residual is {whole.ratio:.3g} times its expectation")
+    findings.passed.append(_residual_words(whole.ratio))
     uncertain = check.calibration_share > SIZE
     shortfall = (whole.prior - whole.chi_squared) / (2 * whole.prior) ** 0.5 if whole.prior else 0.0
     if whole.chi_squared < (1 - SIZE) * whole.prior and float(special.ndtr(-shortfall)) < SIGNIFICANCE:
         findings.notes.append(
-            f"the residual is {whole.chi_squared / whole.prior:.3g} times that of images drawn from the prior: the"
-            f" picture is smoother than the prior, or the noise{' or the uncertainty of H' if uncertain else ''} is"
-            " smaller than stated"
+            "the residual is smaller than for images drawn from the prior"
+            f" ({100 * whole.chi_squared / whole.prior:.3g} % of their chi-squared): the picture is smoother than the"
+            f" prior, or the noise{' or the uncertainty of H' if uncertain else ''} is smaller than stated"
         )
+
+
+def _residual_words(ratio: float) -> str:
+    """Say that a residual passed the check; ratio : chi-squared over its expectation."""
+    size = "as large as expected"
+    if ratio < 1 - SIZE:
+        size = "smaller than expected"
+    elif ratio > 1 + SIZE:
+        size = "larger than expected, but not by more than chance or rounding"
+    return f"the residual is {size} (chi-squared / expectation = {ratio:.3g})"
 
 
 def _excess_words(whole: ResidualPart, beyond: list[ResidualPart]) -> str:
@@ -168,18 +179,15 @@ def _excess_words(whole: ResidualPart, beyond: list[ResidualPart]) -> str:
     places = [place for place in places if place.ratio > STRIKING * whole.ratio]
     where: list[str] = []
     if subs:
-        where.append(named([part.name for part in subs[:MOST_NAMED]]))
+        where.append(f"in {named([part.name for part in subs[:MOST_NAMED]])}")
     elif types:
-        where.append(f"lens type {types[0].name}")
+        where.append(f"in lens type {types[0].name}")
     if places:
-        where.append(f"at the {places[0].name} of the target" if places[0].name != "middle" else "in the middle")
-    if beyond[0] is whole:
-        most = f", most in {where[0]}" if subs or types else ""
-        most += f"{' and' if most else ', most'} {where[-1]}" if places else ""
-        return f"the residual is {whole.ratio:.3g} times what was expected{most}"
-    return (
-        f"the residual of {', '.join(where)} is up to {max(part.ratio for part in beyond):.3g} times what was expected"
-    )
+        where.append(f"{'in' if places[0].name == 'middle' else 'at'} the {places[0].name} of the target")
+    is_everywhere = beyond[0] is whole
+    ratio = whole.ratio if is_everywhere else max(part.ratio for part in beyond)
+    places_words = f"{', most' if is_everywhere else ''} {' and '.join(where)}" if where else ""
+    return f"the residual is too large{places_words} (chi-squared / expectation = {ratio:.3g})"
 
 
 def _judge_error(check: ErrorCheck, findings: _Findings) -> None:

@@ -1,0 +1,202 @@
+"""comparison.html: two runs side by side, with their numbers, pictures, and the keys in which their scenes differ."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from math import hypot, sqrt
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from ommatid.reconstruct.output import facts, verdict_words
+from ommatid.reconstruct.output.run_json import ErrorReport
+from ommatid.runtime.arrays import Float32Array
+from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import make_folder, write_text
+from ommatid.runtime.input_files import real_path
+from ommatid.runtime.outputs.kinds import check_output
+from ommatid.scenes.scene import Scene
+
+from .cached import REPORT, read_stamp
+from .data import Run, block_of, read_run, reduced
+from .document import fill
+from .panels import maps
+from .panels.maps import ColourScale, Panel
+from .tables import PageTable
+
+COMPARISON = "comparison.html"
+NAMES = "A", "B"
+MAPS = 7  # on the page: the truth, and estimate, error and error bar of either run
+NAMED_TABLES = "name"  # key by which a list of tables is told apart
+
+
+def write_comparison(first: Path, second: Path, output: Path) -> Path:
+    """Write the page that compares the runs in two folders, and return its path.
+
+    Raises InputError for folders without a finished run, and for another program's page in the way.
+    """
+    runs = read_run(first), read_run(second)
+    make_folder(output)
+    path = output / COMPARISON
+    check_output(path)
+    if path.is_file() and path.stat().st_size and read_stamp(path)[1] is None:
+        raise InputError(f"{path}: would be replaced, but is a page of another program; choose another folder with -o")
+    urls = [quote(os.fsencode(os.path.relpath(folder / REPORT, output))) for folder in (first, second)]
+    write_text(path, page(*runs, urls))
+    return path
+
+
+def page(first: Run, second: Run, urls: list[str]) -> str:
+    """Return the page of two runs as HTML; urls : of their own pages."""
+    runs = first, second
+    names = [f"{name}: {run.title}" for name, run in zip(NAMES, runs, strict=True)]
+    content: dict[str, Any] = {
+        "title": "Two runs compared",
+        "names": names,
+        "folders": [real_path(run.folder).name for run in runs],
+        "headings": [verdict_words.heading(run.report) for run in runs],
+        "words": difference_words(first, second),
+        "numbers": _numbers(runs),
+        "differences": scene_differences(first.stack.scene, second.stack.scene),
+        "report_urls": urls,
+        "stamp": "0" * 64,
+        **_pictures(runs),
+    }
+    return fill("comparison.html", content)
+
+
+def difference_words(first: Run, second: Run) -> list[str]:
+    """Return whose error is smaller and by how much, and what makes the two hard to compare, as sentences."""
+    errors = first.report.error, second.report.error
+    words = [_measured_words(*errors)] if None not in (errors[0].mse, errors[1].mse) else [_predicted_words(*errors)]
+    if first.truth is not None and second.truth is not None and not np.array_equal(first.truth, second.truth):
+        words.append("The targets differ, so that the errors are those of different pictures.")
+    if first.report.measurements != second.report.measurements:
+        words.append(
+            f"The cameras take {first.report.measurements} and {second.report.measurements} measurements: more of them"
+            " reduce the error in any case."
+        )
+    for name, run in zip(NAMES, (first, second), strict=True):
+        if not verdict_words.is_trusted(run.report):
+            words.append(f"{name} is not to be trusted: its numbers rest on assumptions that do not hold.")
+    return words
+
+
+def _measured_words(first: ErrorReport, second: ErrorReport) -> str:
+    """Compare the measured errors.
+
+    Either scatters about its expectation for its image as its 99 % interval says. If both expectations were equal, the
+    difference would lie within the root of the sum of squares of the distances to the ends that face each other.
+    """
+    small, large, name = (first, second, "A") if (first.mse or 0) <= (second.mse or 0) else (second, first, "B")
+    low, high = small.mse or 0.0, large.mse or 0.0
+    words = f"{name} has the smaller error: {sqrt(low):.3g} against {sqrt(high):.3g} grey levels RMS"
+    if low == high:
+        words = f"Both have the same error, {sqrt(low):.3g} grey levels RMS"
+    below, above = small.expected_given_truth, large.expected_given_truth
+    if below is None or above is None:
+        return f"{words}. Its uncertainty is not known: one of the runs states no interval for its image."
+    uncertainty = hypot(below.mse - below.low, above.high - above.mse)
+    is_larger = high - low > uncertainty
+    return (
+        f"{words}. The difference of the mean squared errors, {high - low:.4g}, is"
+        f" {'larger' if is_larger else 'not larger'} than its uncertainty, {uncertainty:.3g} (99 %)"
+        f"{'' if is_larger else ': it may be chance'}."
+    )
+
+
+def _predicted_words(first: ErrorReport, second: ErrorReport) -> str:
+    """Compare the expected errors, which have no scatter, where a truth is not known."""
+    roots = [sqrt(error.predicted_mse) for error in (first, second)]
+    which = "A" if roots[0] < roots[1] else "B"
+    return (
+        f"A truth is not known. {which} is expected to have the smaller error on average over the prior's images:"
+        f" {min(roots):.3g} against {max(roots):.3g} grey levels RMS."
+    )
+
+
+def scene_differences(first: Scene, second: Scene) -> PageTable:
+    """Return the keys in which two scenes differ, with the values of both; absent ones are empty."""
+    pairs = [dict(_keys(scene.plain())) for scene in (first, second)]
+    names = sorted(pairs[0].keys() | pairs[1].keys())
+    rows = [(name, *(str(each.get(name, "")) for each in pairs)) for name in names]
+    return PageTable("Keys of the scenes that differ", ("key", *NAMES), [row for row in rows if row[1] != row[2]])
+
+
+def _keys(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the keys of a scene with their values, as `--set` takes them: tables of a list by their names."""
+    for name, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _keys(value, f"{before}{name}.")
+        elif isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+            for number, item in enumerate(value):
+                yield from _keys(item, f"{before}{name}.{item.get(NAMED_TABLES, number)}.")
+        else:
+            yield f"{before}{name}", value
+
+
+def _numbers(runs: tuple[Run, Run]) -> PageTable:
+    """Return the facts that sum up both results, and those of their cameras, side by side."""
+    columns: list[dict[str, str]] = []
+    for run in runs:
+        found = {fact.name: fact.words for fact in facts.on_topic(run.report, "error", "quality", "limit", "time")}
+        area = run.stack.camera.measurements * run.stack.camera.pixel_pitch**2
+        found |= {"measurements": str(run.report.measurements), "area of their pixels": f"{area:.4g} mm²"}
+        columns.append(found)
+    names = list(dict.fromkeys((*columns[0], *columns[1])))
+    rows = [(name, *(column.get(name, "") for column in columns)) for name in names]
+    return PageTable("Numbers of both runs", ("quantity", *NAMES), rows)
+
+
+def _pictures(runs: tuple[Run, Run]) -> dict[str, Any]:
+    """Return the maps of both runs, which move together where the images are equally large."""
+    block = max(block_of(run.estimate.shape, MAPS) for run in runs)
+    shown, shapes = _panels(runs, block), [run.estimate.shape for run in runs]
+    if shapes[0] == shapes[1]:
+        groups = [maps.group("maps", [*shown[0], *shown[1]], block, shapes[0])]
+    else:
+        pairs = zip(NAMES, shown, shapes, strict=True)
+        groups = [maps.group(f"maps-{name}", panels, block, shape) for name, panels, shape in pairs]
+    names = [groups[0]["name"], groups[-1]["name"]]
+    by_name = {panel.name: panel for panels in shown for panel in panels}
+    kinds = dict.fromkeys(name.rpartition("-")[0] for name in by_name)
+    ratios = [maps.ratio(*shape) for shape in shapes]
+    cells = [
+        (by_name.get(f"{kind}-{name}"), group, ratio)
+        for kind in kinds
+        for name, group, ratio in zip(NAMES, names, ratios, strict=True)
+    ]
+    tools = list(dict.fromkeys(names))
+    return {"cells": cells, "block": block, "document": maps.document(groups), "group_names": tools}
+
+
+def _panels(runs: tuple[Run, Run], block: int) -> list[list[Panel]]:
+    """Return the panels of both runs, named by their kind and run, with common colours."""
+    pictures = [_maps(run, block) for run in runs]
+    grey = maps.grey_scale([each[kind] for each in pictures for kind in ("truth", "estimate") if kind in each])
+    error = maps.largest([np.abs(each["error"]) for each in pictures if "error" in each])
+    deviation = maps.largest([each["error bar"] for each in pictures])
+    scales = {
+        "truth": grey,
+        "estimate": grey,
+        "error": ColourScale("diverging", -error, error, "estimate minus truth"),
+        "error bar": ColourScale("sequential", 0.0, deviation, "posterior standard deviation"),
+    }
+    return [
+        [
+            Panel(f"{kind}-{name}", f"{kind.capitalize()}, {name}", image, scales[kind], "", maps.value_words(image))
+            for kind, image in each.items()
+        ]
+        for name, each in zip(NAMES, pictures, strict=True)
+    ]
+
+
+def _maps(run: Run, block: int) -> dict[str, Float32Array]:
+    """Return the pictures of a run as means over blocks, by kind."""
+    found = {"truth": run.truth, "estimate": run.estimate}
+    found["error"] = None if run.truth is None else run.estimate - run.truth
+    reduced_maps = {kind: reduced(image, block) for kind, image in found.items() if image is not None}
+    return {**reduced_maps, "error bar": np.sqrt(reduced(run.variance, block))}

@@ -33,4 +33,4 @@ def test_notebooks_have_cells_and_a_title() -> None:
         assert text.count("\n# %%\n") >= 2, "cells of code"
         assert f"({path.name})" in index
         assert f"notebooks/{path.stem}.md" in site
-    assert len(NOTEBOOKS) == 6
+    assert len(NOTEBOOKS) == 7

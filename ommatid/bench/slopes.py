@@ -138,7 +138,7 @@ def recommend(cells: Sequence[Cell], floor: float) -> Recommendation:
     """
     choices = list(_choices(cells, floor))
     if floor <= 0 or not choices:
-        why = "no cell of some stage was measured within the time limit; raise --seconds"
+        why = "no cell of some stage was measured within the time limit; raise --within"
         if floor <= 0:
             why = "the scene has no noise, so there is no noise floor: more samples always reduce the error"
         return Recommendation(noise_floor=floor, mse=None, reached=False, why=why)

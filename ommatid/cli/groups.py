@@ -6,14 +6,14 @@ import inspect
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import wraps
-from typing import Any, get_type_hints
+from typing import Any, cast, get_type_hints
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
     """Return a command for the parser, which has an option for each field of a group in place of the group itself."""
     signature = inspect.signature(command, eval_str=True)
     annotations: dict[str, Any] = {name: each.annotation for name, each in signature.parameters.items()}
-    groups = {name: annotation for name, annotation in annotations.items() if is_dataclass(annotation)}
+    groups = {name: cast(type[Any], each) for name, each in annotations.items() if is_dataclass(each)}
     parameters = [
         each
         for name, parameter in signature.parameters.items()

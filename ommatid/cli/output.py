@@ -10,6 +10,7 @@ import sys
 from collections.abc import Generator, Iterable
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -28,7 +29,6 @@ Detail = Literal["table", "summary", "verdict"]
 LONGEST_LINE = 1000  # characters of a line on stdout, or of a cell of a table
 MOST_WARNINGS = 20  # which are printed of one list
 WIDE = 72  # columns in which a table of several values keeps its names in one line
-SPEED_OVER = 3600.0  # seconds from whose steps the time left follows: a scene may take minutes
 LEAST_WIDTH = 40  # columns of a table; in narrower ones, numbers would be cut off
 
 FILE_OF_STAGE = {"render": "stack.exr", "report": "report.html"}
@@ -103,9 +103,20 @@ class Bars:
     def __init__(self, quiet: bool = False) -> None:
         """Create bars; quiet : True to show none."""
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TextColumn
+        from rich.text import Text
 
-        columns = (TextColumn("{task.description:10}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+        class TimeLeft(ProgressColumn):
+            """The time left at the mean speed, from the first step on, which may take minutes."""
+
+            def render(self, task: Task) -> Text:
+                """Return it as h:mm:ss."""
+                left = (task.elapsed or 0.0) * (1 / task.completed - 1) if task.completed else None
+                return Text(
+                    "" if left is None else f"{timedelta(seconds=round(left))} left", style="progress.remaining"
+                )
+
+        columns = (TextColumn("{task.description:11}"), BarColumn(), TaskProgressColumn(), TimeLeft())
         console = Console(stderr=True)
         disabled = quiet or not console.is_terminal
         self._shown = Progress(
@@ -114,7 +125,6 @@ class Bars:
             transient=True,
             disable=disabled,
             redirect_stdout=False,  # results never go to stderr
-            speed_estimate_period=SPEED_OVER,
         )
 
     @contextmanager

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping
 from math import hypot, sqrt
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import quote
 
 import numpy as np
@@ -130,9 +130,9 @@ def _keys(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, A
     """Yield the keys of a scene with their values, as `--set` takes them: tables of a list by their names."""
     for name, value in content.items():
         if isinstance(value, Mapping):
-            yield from _keys(value, f"{before}{name}.")
-        elif isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
-            for number, item in enumerate(value):
+            yield from _keys(cast(Mapping[str, Any], value), f"{before}{name}.")
+        elif value and isinstance(value, list) and all(isinstance(item, Mapping) for item in cast(list[Any], value)):
+            for number, item in enumerate(cast(list[Mapping[str, Any]], value)):
                 yield from _keys(item, f"{before}{name}.{item.get(NAMED_TABLES, number)}.")
         else:
             yield f"{before}{name}", value

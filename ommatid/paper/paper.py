@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.figures.camera_drawing import write_drawing
+from ommatid.figures.camera_drawing import camera_drawing
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import write_csv, write_text
@@ -19,6 +19,7 @@ from ommatid.runtime.outputs.kinds import check_output
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import Purpose, stream
+from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import read
 from ommatid.scenes.tables.gallery import GALLERY
 
@@ -164,7 +165,7 @@ def _combinations(computed: Tiles, side: int) -> list[PaperTile]:
 def _write_figures(folder: Path, shown: Computed, files: FigureFiles) -> None:
     computed, photograph = shown.tiles, shown.photograph
     camera = read(GALLERY / "tile19.toml")
-    write_drawing(folder / "fig1.png", camera, files)
+    files.replace(camera_drawing(camera, derive(camera)), folder / "fig1.png")
     figures.draw_sweeps(folder / "fig2.png", _combinations(computed, 19), files)
     figures.draw_maps(folder / "fig3.png", _combinations(computed, 19), MAP_NOISE, files)
     figures.draw_sweeps(folder / "fig4.png", _combinations(computed, 35), files)

@@ -405,7 +405,7 @@ def test_the_table_of_a_batch_is_sorted_by_its_headings(run: Run, tmp_path: Path
         for name, mse in (("b", 20.0), ("c", 100.0), ("a", 3.0))
     ]
     path = tmp_path / "index.html"
-    text = index_of([BatchEntry("lost", failure="no such file"), *entries], [], "", "batch", "0")
+    text = index_of([BatchEntry("lost", failure="no such file"), *entries], "0", title="Batch: batch")
     path.write_text(re.sub("<img[^>]*>", "", text), encoding="utf-8")
     with shown(path, width=390) as page:
         assert page.evaluate("document.documentElement.scrollWidth") == 390, "the text above the table wraps"

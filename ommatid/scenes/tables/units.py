@@ -198,8 +198,10 @@ def _corner(value: object) -> object:
 def _whole_pair(value: object, least: int, expected: str) -> object:
     numbers = list(cast(Sequence[object], value)) if isinstance(value, list | tuple) else None
     if numbers is None or len(numbers) != 2 or not all(type(each) is int and each >= least for each in numbers):
-        raise ValueError(f"expected {expected}, got {shortened_repr(value if numbers is None else numbers)}")
-    return pair(value)
+        raise ValueError(
+            f"expected {expected}, got {shortened_repr(cast(object, value) if numbers is None else numbers)}"
+        )
+    return tuple(numbers)
 
 
 def _plain_ratios(ratios: tuple[Fraction, ...]) -> list[str | int]:

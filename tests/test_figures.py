@@ -409,6 +409,7 @@ NOT_OUTPUT = {
     "README.md": ("pip install .",),
     "install.md": ("source .venv/bin/activate", "pip install ."),
     "lenses.md": ("# radius  thickness",),
+    "python.md": ("import deepinv, torch",),
     "coverage.md": ("python -m tests.benchmarks",),
     "worlds.md": ("offset of the lens",),
 }

@@ -21,6 +21,7 @@ from ommatid.reconstruct.output.overview import placed_sub_image
 from ommatid.reconstruct.output.result_files import read_estimate
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import cached, fingerprint, write_whole
+from ommatid.runtime.input_files import read_bytes
 from ommatid.runtime.printable import printable
 from ommatid.scenes import stack as stack_file
 from ommatid.scenes.formats.picture import averaged
@@ -28,6 +29,8 @@ from ommatid.scenes.formats.picture import averaged
 from .frames import Frame, FrameOptions
 
 FILM = "film.gif"
+COMMENT = b"!\xfe"  # precedes the length and the text of a comment in GIF files
+MOST_BYTES = 100_000_000  # of a file that is read
 VERSION = 1  # of the drawing: another one draws films anew
 MOST_FRAMES = 60
 MOST_PIXELS = 12_000_000  # of all panels of all frames: some 9 MB of a photograph
@@ -92,10 +95,10 @@ def cached_film(folder: Path, frames: Sequence[Frame], options: FrameOptions) ->
 
 
 def _read_stamp(path: Path) -> tuple[None, str]:
-    from PIL import Image
-
-    with Image.open(path) as picture:
-        return None, bytes(picture.info["comment"]).decode()
+    before, _, after = read_bytes(path, MOST_BYTES).partition(COMMENT)
+    if not before.startswith(b"GIF8") or not after:
+        raise ValueError("expected a GIF file with a comment")
+    return None, after[1 : 1 + after[0]].decode("ascii")
 
 
 def _write(path: Path, pictures: list[NDArray[np.uint8]], *, stamp: str) -> None:

@@ -146,9 +146,7 @@ def test_fill_factors_beat_magnifications_at_low_noise_and_not_at_high() -> None
 
 
 def test_the_command_writes_the_best_cameras(here: Path, ommatid: Command) -> None:
-    magnifications = 'design.magnifications="1/3,...,1/5"'
-    assert ommatid("design", "tile19", "--set", magnifications).code == 2, "dots need a step"
-    listed = "--set", 'design.magnifications="1/3,1/4,1/5"', "-o", "best"
+    listed = "--set", 'design.magnifications="1/3,...,1/5"', "-o", "best"
     found = document(ommatid("design", "tile19", *listed, "--json"))
     assert found["cameras"][0]["arrays"] == [1, 1, 1]
     assert found["bound"] <= found["mixture"]["mse"] <= found["cameras"][0]["mse"] == found["own"]["mse"]

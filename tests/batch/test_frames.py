@@ -146,7 +146,7 @@ def test_what_cannot_be(film: Path, tmp_path: Path, ommatid: Command) -> None:
         ((*several, "-o", tmp_path / "out", "--set", "noise.variance=1"), "[noise] is already recorded"),
         ((*several, "-o", tmp_path / "out", "--region", "0,0,99,9"), "a region of 99 x 9 pixels"),
         ((*several[:2], film / "none.npz", "-o", tmp_path / "out"), "none.npz"),
-        ((several[0], several[2], several[1], "-o", tmp_path / "out"), "f1.exr"),
+        ((several[0], several[2], several[1], "-o", tmp_path / "out"), "name the model last"),
     ):
         ended = ommatid("reconstruct", *arguments)
         assert ended.code == 2

@@ -400,5 +400,5 @@ def test_a_gallery_scene_is_not_replaced_by_a_result(tmp_path: Path, monkeypatch
     monkeypatch.setattr(gallery, "GALLERY", tmp_path)
     with pytest.raises(InputError, match="would replace the file that is read"):
         export_scene(Path("tile19"), scene)
-    with pytest.raises(InputError, match="would replace the file that is read"):
+    with pytest.raises(InputError, match="expected the name of a model"):
         calibrate_file(Path("tile19"), scene, (), (), None, no_progress)

@@ -49,7 +49,7 @@ def test_extreme_numbers_are_refused(here: Path, ommatid: Command) -> None:
     for number in (str(2**63), "9" * 5000, "-" + "9" * 30, "1e5", "inf", "", "\0"):
         for read, text in (
             (lambda text: options.Frames(origin=text).settings, f"{number},1"),
-            (lambda text: options.regions([text]), f"0,0,{number},1"),
+            (lambda text: options.region("--region", text), f"0,0,{number},1"),
             (lambda text: job_numbers(text, {}), f"1/{number}"),
             (lambda text: job_numbers("/4", {"PBS_ARRAY_INDEX": text}), number or "x"),
         ):

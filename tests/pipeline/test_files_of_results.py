@@ -84,7 +84,7 @@ def test_one_of_many_frames_removes_its_old_formats(finished: Path, here: Path, 
     command = "reconstruct", *stacks, finished / "model.npz", "-o", "film", "-q"
     assert ommatid(*command, "--format", "npy,tiff16").code == 0
     assert ommatid(*command, *CHANGED).code == 0
-    assert names(here / "film") == {"a.exr", "a.png", "b.exr", "b.png"}
+    assert names(here / "film") == {"a.exr", "a.png", "b.exr", "b.png", "film.gif", "index.html"}
 
 
 def _removes_the_stack(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, str]:

@@ -194,7 +194,7 @@ def write_files() -> None:
         Path(f"{name}.csv").write_text(text + "\n", encoding="utf-8")
 
 
-IMPORT, CALIBRATE = ("import", "scene.toml", "-o", "new"), ("calibrate", "scene.toml", "-o", "new", "--points")
+IMPORT, CALIBRATE = ("import", "scene.toml", "-o", "new.exr"), ("calibrate", "scene.toml", "-o", "new.npz", "--points")
 
 
 SMALL = ["small.npy"] * 13

@@ -27,6 +27,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "calibrate": (("tiny.toml", "-o", "calibrated.npz"),),
     "reconstruct": ((*RUN, "-o", "reconstructed"),),
     "report": (("results",),),
+    "figure": (("results/tiny", "-o", "slide.png"),),
     "check": (RUN,),
     "import": (("tiny.toml", "mosaic.npy", "-o", "imported.exr", "--origin", "0,0"),),
     "export": (("tiny.toml", "-o", "exported.xml"), (RUN[1], "-o", "exported.npz")),

@@ -168,7 +168,7 @@ def _residual_words(ratio: float) -> str:
         size = "smaller than expected"
     elif ratio > 1 + SIZE:
         size = "larger than expected, but not by more than chance or rounding"
-    return f"the residual is {size} (chi-squared / expectation = {ratio:.3g})"
+    return f"the residual is {size} (chi-squared ratio {ratio:.3g})"
 
 
 def _excess_words(whole: ResidualPart, beyond: list[ResidualPart]) -> str:
@@ -187,7 +187,7 @@ def _excess_words(whole: ResidualPart, beyond: list[ResidualPart]) -> str:
     is_everywhere = beyond[0] is whole
     ratio = whole.ratio if is_everywhere else max(part.ratio for part in beyond)
     places_words = f"{', most' if is_everywhere else ''} {' and '.join(where)}" if where else ""
-    return f"the residual is too large{places_words} (chi-squared / expectation = {ratio:.3g})"
+    return f"the residual is too large{places_words} (chi-squared ratio {ratio:.3g})"
 
 
 def _judge_error(check: ErrorCheck, findings: _Findings) -> None:

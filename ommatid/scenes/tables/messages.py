@@ -89,7 +89,7 @@ def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel
     if error_type in ("model_type", "dict_type"):
         inside = [known.rsplit(".", 1)[-1] for known in _inside(_bare(location), known_keys(model))]
         message = f"expected a table, whose keys are {named(inside)}"
-    if key == "camera.lens":
+    if key == "camera.lens" and error_type != "value_error":
         message = "expected a table [[camera.lens]] for each lens type"
     if "got" not in message:
         message = f"{message}, got {shortened_repr(problem['input'])}"

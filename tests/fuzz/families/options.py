@@ -20,6 +20,7 @@ HARMLESS: dict[str, tuple[str, ...]] = {
     "calibrate": (SCENE, "-o", "new.npz"),
     "reconstruct": ("sound.exr", "sound.npz", "-o", "new.exr"),
     "report": (RUN,),
+    "figure": (RUN, "-o", "new.svg"),
     "check": ("sound.exr", "sound.npz"),
     "import": (SCENE, "mosaic.npy", "-o", "new.exr", "--origin", "0,0"),
     "export": (SCENE, "-o", "new.xml"),

@@ -154,7 +154,8 @@ def grey(pixels: NDArray[Any], where: str) -> FloatArray:
 def _part_asked_for(scene: Scene, stored: StoredPicture) -> FloatArray:
     """The crop of a picture in the scene's range of values, rounded to float32. Raises InputError."""
     target, where = scene.target, f"{scene.source}: target.image"
-    picture = luminance(stored.pixels, where) * (1.0 if stored.bits is None else _step(stored.bits))
+    with np.errstate(over="ignore", invalid="ignore"):  # of values that are not finite, which are refused below
+        picture = luminance(stored.pixels, where) * (1.0 if stored.bits is None else _step(stored.bits))
     if target.origin is None:
         if target.shape is not None and finer(target.shape, target.detail) != picture.shape:
             rows, columns = finer(target.shape, target.detail)

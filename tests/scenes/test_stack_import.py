@@ -206,12 +206,12 @@ WRONG: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
     ((*IMPORT, "three.npy"), ("13 pictures", "got 3")),
     ((*IMPORT, *SMALL), ("small.npy", "5 x 6", "20 x 30")),
     ((*IMPORT, "m.npy", "--flat", "dark.npy"), ("dark.npy", "42 x 62", "42 x 61")),
-    (("import", "scene.toml", "m.npy", "-o", "m.npy"), ("m.npy", "would replace")),
+    (("import", "scene.toml", "m.npy", "-o", "m.npy"), ("m.npy", "expected the name of a stack")),
     ((*CALIBRATE, "m.npy"), ("168 pixels", "got 1", "--places")),
     ((*CALIBRATE, "m.npy", "--places", "twice.csv"), ("line 3", "twice")),
     ((*CALIBRATE, "m.npy", "--places", "close.csv"), ("m.npy", "(5, 5)", "(6, 6)", "two images")),
     ((*CALIBRATE, "m.npy", "--places", "few.csv"), ("few.csv", "row 0, column 1")),
-    (("calibrate", "scene.toml", "-o", "new", "--places", "few.csv"), ("--points",)),
+    (("calibrate", "scene.toml", "-o", "new.npz", "--places", "few.csv"), ("--points",)),
 ]
 
 

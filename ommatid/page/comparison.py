@@ -12,6 +12,7 @@ from urllib.parse import quote
 import numpy as np
 
 from ommatid.reconstruct.output import facts, verdict_words
+from ommatid.reconstruct.output.result_files import check_run_folder
 from ommatid.reconstruct.output.run_json import ErrorReport
 from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError
@@ -38,6 +39,8 @@ def write_comparison(first: Path, second: Path, output: Path) -> Path:
 
     Raises InputError for folders without a finished run, and for another program's page in the way.
     """
+    for folder in (first, second):
+        check_run_folder(folder)
     runs = read_run(first), read_run(second)
     make_folder(output)
     path = output / COMPARISON

@@ -102,7 +102,7 @@ def test_a_page_shows_two_runs(run: Run, tmp_path: Path) -> None:
     path.write_text("<html>another program</html>", encoding="utf-8")
     with pytest.raises(InputError, match="another program"):
         write_comparison(run.folder, run.folder, tmp_path / "both")
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="expected the folder of a run"):
         write_comparison(run.folder, tmp_path, tmp_path / "both")
     assert path.name == comparison.COMPARISON
 

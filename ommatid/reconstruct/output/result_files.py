@@ -35,7 +35,7 @@ from .run_json import RUN, RegionReport, RunReport
 
 Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the corner, rows and columns
 
-ESTIMATE, PICTURE = "estimate.exr", "estimate.png"
+ESTIMATE, PICTURE, STACK = "estimate.exr", "estimate.png", "stack.exr"
 PNG_END = b"IEND\xaeB`\x82"
 ESTIMATOR_TABLES = ("prior", "estimator", "tiles")
 
@@ -122,6 +122,14 @@ def read_estimate(path: Path) -> exr.Part:
                 f"{path}: expected a finite estimate and variances of at least 0, got others; run the scene again"
             )
     return part
+
+
+def check_run_folder(folder: Path) -> tuple[Path, ...]:
+    """Return the files of a finished run in a folder. Raises InputError for a folder without them."""
+    for name in (ESTIMATE, STACK, RUN):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder}: expected the folder of a run, got one without {name}; run a scene first")
+    return tuple(folder / name for name in (ESTIMATE, STACK, RUN))
 
 
 def write_picture(path: Path, estimate: FloatArray) -> None:

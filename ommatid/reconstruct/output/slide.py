@@ -26,10 +26,9 @@ from ommatid.scenes import stack as stack_file
 from ..restore import check_region
 from . import run_json
 from .overview import placed_sub_image, result_panels
-from .result_files import ESTIMATE, Region, read_estimate
+from .result_files import ESTIMATE, STACK, Region, check_run_folder, read_estimate
 
 PANELS = ("truth", "sub-image", "estimate", "error", "deviation")
-STACK = "stack.exr"
 SIDE, GAP, EDGE = 3.0, 0.3, 0.25  # inches: widest and tallest panel, between panels, around all
 TITLE, FOOT = 0.65, 0.75  # inches above the panels and below them
 BAR, INSET, LENGTH = 0.13, 0.1, 0.06  # inches: height of a bar, what it is shorter at either end, height of a scale bar
@@ -52,10 +51,7 @@ def write_slide(
     Raises InputError for a folder without a run, unknown panels, or a part outside, and MachineError.
     """
     chosen, kind = _known(names), figure_format(path)
-    for name in (ESTIMATE, STACK, run_json.RUN):
-        if not (folder / name).is_file():
-            raise InputError(f"{folder}: expected the folder of a run, got one without {name}; run a scene first")
-        check_output(path, folder / name)
+    check_output(path, *check_run_folder(folder))
     stack = stack_file.read(folder / STACK)
     panels = result_panels(read_estimate(folder / ESTIMATE).channels)
     best = run_json.read(folder).error.baseline

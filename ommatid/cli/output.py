@@ -6,6 +6,7 @@ All other modules print by these functions, which escape and shorten what came f
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Generator, Iterable
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -197,10 +198,10 @@ def batch_bars(count: int, quiet: bool = False) -> Generator[BatchBars]:
 
 def print_lines(lines: Iterable[str], *, alarm: bool = False) -> None:
     """Print lines on stdout; with `alarm` the first in red where stdout is a terminal."""
+    in_red = alarm and sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     for number, line in enumerate(lines):
-        typer.secho(
-            printable(line, LONGEST_LINE), fg="red" if alarm and number == 0 else None, bold=alarm and number == 0
-        )
+        words = printable(line, LONGEST_LINE)
+        print(typer.style(words, fg="red", bold=True) if in_red and number == 0 else words)
 
 
 def print_report(name: str, page: Path | None, report: RunReport, sections: Iterable[Section], detail: Detail) -> None:

@@ -15,6 +15,7 @@ knows the calibrated H.
 from __future__ import annotations
 
 import importlib
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -48,6 +49,7 @@ from ommatid.scenes.tables.estimation import PriorTable
 
 BASELINES = "baselines.exr"
 LARGEST = 2**18  # pixels of f up to which total variation takes minutes
+UNREADABLE = OSError, ValueError, KeyError, TypeError  # reading what is missing or of another program
 HALF = 1e-6  # of a pixel, within which a position lies halfway between two
 WEIGHTS = tuple(3.0**-power for power in range(-2, 8))  # per grey level
 RISEN = 1.05  # ratio to the least error from which smaller weights are not tried
@@ -95,11 +97,17 @@ def cached_baselines(
 
 def known_baselines(folder: Path, fingerprint: str) -> Baselines | None:
     """Return the baselines in a folder, None without those of the results with this fingerprint."""
-    try:
+    with suppress(*UNREADABLE):
         found, made_from = _read(folder / BASELINES)
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return found if made_from == fingerprint else None
+        return found if made_from == fingerprint else None
+    return None
+
+
+def remove_other_baselines(folder: Path, fingerprint: str) -> None:
+    """Remove the baselines of results with another fingerprint from a folder; a file of another program stays."""
+    with suppress(*UNREADABLE):
+        if _read(folder / BASELINES)[1] != fingerprint:
+            (folder / BASELINES).unlink()
 
 
 def _read(path: Path) -> tuple[Baselines, str | None]:

@@ -74,7 +74,7 @@ Crop = Annotated[
     str,
     typer.Option("--crop", metavar="ROW,COLUMN,ROWS,COLUMNS", help="Show this part of the target (default: all)."),
 ]
-DarkGround = Annotated[bool, typer.Option("--dark", help="Draw on dark ground, for dark slides.")]
+DarkGround = Annotated[bool, typer.Option("--dark-ground", help="Draw light on dark, for dark slides.")]
 
 
 def reconstruct(

@@ -29,10 +29,9 @@ DATE = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
 
 @dataclass(frozen=True)
 class FigureFiles:
-    """The formats in which a command writes each of its figures, and the dots per inch of PNG files."""
+    """The formats in which a command writes each of its figures."""
 
     formats: tuple[str, ...] = ("png",)
-    resolution: int = SCREEN
 
     def paths(self, path: Path) -> list[Path]:
         """Return the files of a figure, one per format; the suffix of `path` is replaced."""
@@ -40,7 +39,7 @@ class FigureFiles:
 
     def save(self, figure: Any, path: Path) -> None:
         """Write a figure in every format. Raises InputError or MachineError."""
-        save_figure(figure, path, self.formats, self.resolution)
+        save_figure(figure, path, self.formats)
 
     def replace(self, figure: Any, path: Path) -> None:
         """Write a figure in every format, and remove its files in others, which show something older."""

@@ -45,8 +45,9 @@ def page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: s
     stamp : fingerprint of the content, by which an up-to-date page is recognised
     """
     content, most = of_run(run, ideal, bench), sensor.MOST_VALUES
+    of_page = {"folder": run.folder, "stamp": stamp}
     while True:
-        html = fill("page.html", {**content, **of_sensor(run.stack, content["groups"], most), "stamp": stamp})
+        html = fill("page.html", {**content, **of_sensor(run.stack, content["groups"], most), **of_page})
         if len(html.encode()) <= LARGEST or most <= sensor.MOST_VALUES // LARGEST_REDUCTION:
             return html
         most //= 2
@@ -65,7 +66,7 @@ def page_of(folder: Path) -> str:
         return page(run, partial(matrix_as_designed, run.stack.camera), None, run.report.fingerprint)
     if not {"stack", "model", "estimate"} & parts.keys():
         raise InputError(f"{folder}: expected stack.exr, model.npz or estimate.exr, got none; run a scene first")
-    return fill("parts_page.html", {**of_parts(folder, parts), "stamp": ""})
+    return fill("parts_page.html", {**of_parts(folder, parts), "folder": folder, "stamp": ""})
 
 
 def of_run(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None) -> dict[str, Any]:

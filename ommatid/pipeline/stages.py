@@ -215,14 +215,12 @@ def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunRep
 
 
 def _with_known_baselines(results: StageResults, folder: Path) -> StageResults:
-    """Return results with the baselines in the folder, or remove those of other results."""
-    from ommatid.analysis.baselines import BASELINES, known_baselines
+    """Return results with the baselines in the folder, from which those of other results are removed."""
+    from ommatid.analysis.baselines import known_baselines, remove_other_baselines
 
-    if not (folder / BASELINES).exists():
-        return results
     known = known_baselines(folder, results.report.fingerprint)
     if known is None:
-        (folder / BASELINES).unlink()
+        remove_other_baselines(folder, results.report.fingerprint)
         return results
     return replace(results, report=results.report.with_changes(baselines=known.reports))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +11,11 @@ import numpy as np
 import pytest
 
 from ommatid.analysis import baselines
-from ommatid.analysis.baselines import BASELINES, known_baselines
+from ommatid.analysis.baselines import BASELINES, known_baselines, remove_other_baselines
 from ommatid.page import comparison
 from ommatid.page.comparison import difference_words, scene_differences, write_comparison
 from ommatid.page.data import Run, read_run
-from ommatid.page.documentation import PAGES, ROOT
+from ommatid.page.documentation import PAGES, ROOT, documentation
 from ommatid.page.sections import page
 from ommatid.pipeline.stages import add_baselines
 from ommatid.reconstruct.output import facts, run_json
@@ -107,7 +108,7 @@ def test_a_page_shows_two_runs(run: Run, tmp_path: Path) -> None:
     assert path.name == comparison.COMPARISON
 
 
-def test_baselines_are_in_run_json_and_on_the_page(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_baselines_are_in_run_json_and_on_the_page(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "find_spec", lambda _: None)  # total variation has its own tests
     report = add_baselines(run.folder, no_progress)
     assert [each.method for each in report.baselines] == ["single", "rearranged", "shift_and_add"]
@@ -119,6 +120,15 @@ def test_baselines_are_in_run_json_and_on_the_page(run: Run, monkeypatch: pytest
     assert facts.baseline_words(report) in html.unescape(text)
     assert "Pixel rearrangement" in text
     assert known_baselines(run.folder, "another") is None
+    foreign = tmp_path / BASELINES
+    foreign.write_text("of another program", encoding="ascii")
+    remove_other_baselines(tmp_path, report.fingerprint)
+    assert foreign.read_text(encoding="ascii") == "of another program"
+    shutil.copy(run.folder / BASELINES, foreign)
+    remove_other_baselines(tmp_path, report.fingerprint)
+    assert foreign.exists()
+    remove_other_baselines(tmp_path, "another")
+    assert not foreign.exists()
     written = (run.folder / BASELINES).stat().st_mtime_ns
     assert add_baselines(run.folder, no_progress) == report
     assert (run.folder / BASELINES).stat().st_mtime_ns == written
@@ -136,3 +146,13 @@ def test_sections_link_to_headings_that_exist() -> None:
         headings = [line.lstrip("# ") for line in text.splitlines() if line.startswith("#")]
         anchors = {"".join(c for c in each.lower().replace(" ", "-") if c.isalnum() or c == "-") for each in headings}
         assert heading in {"", *anchors}, title
+
+
+def test_links_are_relative_and_only_inside_the_checkout(tmp_path: Path) -> None:
+    assert all(documentation(section, tmp_path).url == "" for section in PAGES)
+    for section, (_, name, heading) in PAGES.items():
+        address, _, anchor = documentation(section, ROOT / "out" / "a b").url.partition("#")
+        path = (ROOT / "out" / "a b" / address).resolve()
+        assert not address.startswith("/")
+        assert path.is_file()
+        assert (path.stem, anchor) == (name, heading)

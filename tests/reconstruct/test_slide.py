@@ -69,7 +69,7 @@ def test_the_scale_bar_is_a_round_length(most: float, length: float) -> None:
 def test_the_suffix_decides_the_format(finished: Path, tmp_path: Path, ommatid: Command) -> None:
     for suffix, start in STARTS.items():
         file = tmp_path / f"slide{suffix}"
-        ended = ommatid("figure", finished, "-o", file, "--panels", "estimate,error", "--dark", "--json")
+        ended = ommatid("figure", finished, "-o", file, "--panels", "estimate,error", "--dark-ground", "--json")
         assert ended.code == 0, ended.err
         assert json.loads(ended.out) == {"file": str(file), "panels": ["estimate", "error"]}
         assert file.read_bytes().startswith(start)

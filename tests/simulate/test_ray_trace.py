@@ -282,9 +282,10 @@ def test_depth_of_field_ends_where_the_thin_lens_blurs_over_a_pixel() -> None:
         assert wide * abs(image - depth) / image == pytest.approx(blur)
     # Focused at the hyperfocal distance it reaches from half of that to infinity.
     hyperfocal = depth * aperture / blur
-    near, far = sharpness.depth_of_field(depth, 1 / hyperfocal * (1 - 1e-15), aperture, blur)
-    assert near == pytest.approx(hyperfocal / 2)
-    assert far is None
+    for rounded in (1 - 1e-15, 1 + 1e-15):
+        near, far = sharpness.depth_of_field(depth, rounded / hyperfocal, aperture, blur)
+        assert near == pytest.approx(hyperfocal / 2)
+        assert far is None
 
 
 def test_a_thin_real_lens_is_reported_as_a_thin_lens() -> None:

@@ -28,6 +28,7 @@ from .field import LEAST_VERGENCE, LensField, field_of
 from .point_spread import grid_of, point_spread, strehl_ratio
 from .wavefront import Wavefront
 
+ROUNDING = 1e-9  # relative difference of vergences that are equal
 FOCUS_STEPS = 21  # of a curve through focus
 FOCUS_ZEROS = 1.5  # its ends, times the shift N / frequency; a disk of rays has its first zero at 1.22
 FOCUS_WAVES = 10.0  # of defocus, at most at its ends
@@ -62,7 +63,8 @@ def depth_of_field(
     """
     slope = blur / (depth * diameter)
     near = (1 + slope * pupil) / (vergence + slope) if vergence + slope > 0 else None
-    far = (1 - slope * pupil) / (vergence - slope) if vergence - slope > 0 else None
+    beyond = vergence - slope
+    far = (1 - slope * pupil) / beyond if beyond > ROUNDING * slope else None
     return near, far
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.optics.prescription import Prescription
 from ommatid.scenes.scene import parse, read
-from ommatid.simulate.lenses.prescription import Prescription
 
 from .examples import GALLERY
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ommatid.simulate.lenses.prescription import Prescription
+from ommatid.scenes.optics.prescription import Prescription
 
 STEP = 1e-6  # of differences of slopes
 

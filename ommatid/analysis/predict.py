@@ -69,7 +69,7 @@ def optics(camera: Camera) -> list[dict[str, Any]]:
     """Return the sharpness of the lens types in JSON's types; empty where all are pinholes."""
     if not camera.has_width:
         return []
-    from ommatid.simulate.lenses.sharpness import describe
+    from ommatid.scenes.optics.sharpness import describe
 
     return describe(camera)
 
@@ -84,6 +84,6 @@ def electrons(setup: Setup) -> dict[str, Any] | None:
     light = summary(setup.scene, setup.camera, response(setup))
     if all(lens_type.optics.surfaces is None for lens_type in setup.camera.types):
         return light
-    from ommatid.simulate.lenses.etendue import transmissions
+    from ommatid.scenes.optics.etendue import transmissions
 
     return {**light, "transmitted": transmissions(setup.camera)}

@@ -33,7 +33,7 @@ def focus_curves(scene: Scene) -> list[ThroughFocus]:
     camera = derive(scene)
     if not camera.has_width:
         return []
-    from ommatid.simulate.lenses.sharpness import through_focus
+    from ommatid.scenes.optics.sharpness import through_focus
 
     with naming_source(scene.source):
         return through_focus(camera)

@@ -288,7 +288,7 @@ def designed_observation(camera: Camera) -> Observation | None:
         if camera.has_boxes(lens_type):
             parts.append(designed_box(camera.shape, lens_type))
         else:
-            from .optics.blur import kernels
+            from .optics.lens_kernels import kernels
 
             parts.append(kernels(camera.on_grids, lens_type))
     return Observation(camera.shape, tuple(parts))

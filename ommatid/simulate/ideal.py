@@ -2,8 +2,7 @@
 
 Through a pinhole a footprint is a rectangle of m x m pixels of f, so H is a Kronecker product of two overlaps along one
 axis for every sub-imager (Wood et al., section 2). Distorted and misaligned footprints follow by exact area overlap,
-those blurred by defocus and diffraction from the blur's own transform, those of lenses with surfaces from the waves
-that are traced through them.
+those of lenses from their waves.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, views_as_designed
-from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import Model, designed_observation, fitted_model, is_stored
@@ -54,10 +52,6 @@ def ideal_matrix(camera: Camera) -> sparse.csr_array:
 def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
     blurred = camera.is_blurred(lens_type)
-    if lens_type.optics.surfaces is not None and not lens_type.is_rotated:
-        from .lenses import surface_matrix
-
-        return surface_matrix.matrix(camera, lens_type)
     if lens_type.optics.distortion is not None or lens_type.is_rotated:
         from ommatid.scenes.optics import footprints
 
@@ -68,9 +62,9 @@ def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
             )
         parts = [footprints.sub_matrix(camera, sub, pose_of(sub)) for sub in subs]
     elif blurred:
-        from ommatid.scenes.optics import blur
+        from ommatid.scenes.optics.lens_kernels import blurred_matrix
 
-        return blur.matrix(camera, lens_type, *blur.blurs_of(camera, lens_type))
+        return blurred_matrix(camera, lens_type)
     else:
         parts = [sub_matrix(camera, sub) for sub in subs]
     return sparse.csr_array(sparse.vstack(parts, format="csr"))
@@ -131,16 +125,11 @@ def designed_kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
 
     Expects a lens type for which `Camera.has_kernel` is true. Raises InputError if kernels do not hold it.
     """
-    if lens_type.optics.surfaces is not None:
-        from .lenses import surface_kernels
-
-        return surface_kernels.kernels(camera, lens_type)
     if lens_type.steered:
         raise InputError(f"camera.lens.{lens_type.name}: sub-imagers off the grid have kernels of their own")
-    from ommatid.scenes.optics import blur
+    from ommatid.scenes.optics.lens_kernels import kernels
 
-    exact = blur.kernels(camera, lens_type)
-    return replace(exact, shapes=KernelShapes.low_rank(exact.shapes.kernels, exact.places.width))
+    return kernels(camera, lens_type)
 
 
 def _designed_by_kernels(camera: Camera) -> FittedMatrix:

@@ -152,7 +152,7 @@ def response(setup: Setup) -> FloatArray:
     scene, camera = setup.scene, setup.camera
     if all(lens_type.optics.surfaces is None for lens_type in camera.types):
         return electrons(scene, camera)
-    from .lenses.etendue import relative_illumination, solid_angles, transmissions
+    from ommatid.scenes.optics.etendue import relative_illumination, solid_angles, transmissions
 
     passed = transmissions(camera)
     transmitted = {name: angle * passed[name] for name, angle in solid_angles(camera).items()}

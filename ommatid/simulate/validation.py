@@ -8,7 +8,6 @@ from math import ceil
 from ommatid.runtime.errors import naming_source
 from ommatid.runtime.machine import check_memory
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.constants import DEVIATIONS
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.setup import Setup
 
@@ -55,7 +54,7 @@ def check_lenses(camera: Camera) -> None:
     """Raise InputError for surfaces that form no image, and for distortion that folds the image."""
     for lens_type in camera.types:
         if lens_type.optics.surfaces is not None:
-            from .lenses.prescription import prescription_of
+            from ommatid.scenes.optics.prescription import prescription_of
 
             prescription_of(camera, lens_type)
         if lens_type.optics.distortion is not None:
@@ -81,22 +80,8 @@ def check_entries(setup: Setup, types: Iterable[LensType], why: str = "") -> Non
 def _visible_pixels(camera: Camera, lens_type: LensType) -> int:
     """Approximate number of pixels of f that a sensor pixel may see."""
     side = ceil(lens_type.ratio) + BESIDE
-    if lens_type.optics.surfaces is not None:
-        side += 2 * ceil(_diffraction_reach(camera, lens_type) + DEVIATIONS * camera.diffusion(lens_type))
-    elif camera.is_blurred(lens_type):
-        from ommatid.scenes.optics.blur import blur_of
+    if camera.is_blurred(lens_type):
+        from ommatid.scenes.optics.field import light_reach
 
-        side += 2 * ceil(blur_of(camera, lens_type).reach)
+        side += 2 * ceil(light_reach(camera, lens_type))
     return side**2
-
-
-def _diffraction_reach(camera: Camera, lens_type: LensType) -> float:
-    """How far, in pixels of f, the point-spread function of surfaces is computed in focus."""
-    from .lenses.prescription import prescription_of
-    from .lenses.wavefront import GRID_REACH
-
-    depth = camera.depth(lens_type)
-    working = prescription_of(camera, lens_type).working_f_number(depth)
-    return (
-        GRID_REACH * (camera.wavelength or 0.0) * working * camera.distance_of(lens_type) / depth / camera.target_pitch
-    )

@@ -13,7 +13,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import check_memory, free_memory
 from ommatid.scenes import camera, model_file, scene
 from ommatid.scenes.formats import npz, picture_file
-from ommatid.scenes.optics.blur import blur_of
+from ommatid.scenes.optics.field import light_reach
 
 from ..conftest import TINY, Command, shell
 from ..examples import scene as example
@@ -83,7 +83,7 @@ def test_a_blur_that_cannot_be_computed_is_refused() -> None:
         table = example().camera.model_copy(update={"lens": (lens.model_copy(update=update),)})
         derived = camera.derive(example().model_copy(update={"camera": table}))
         with pytest.raises(InputError, match=r"its blur reaches|expected a cone of light of f/0\.5"):
-            blur_of(derived, derived.types[0])
+            light_reach(derived, derived.types[0])
 
 
 # Files

@@ -14,10 +14,10 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.optics import spectrum
+from ommatid.scenes.optics.field import field_of
+from ommatid.scenes.optics.point_spread import point_spread
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import Scene, parse, read, with_changes, write
-from ommatid.simulate.lenses.field import field_of
-from ommatid.simulate.lenses.point_spread import point_spread
 
 from ..examples import scene
 from ..printed_figures import check_figures

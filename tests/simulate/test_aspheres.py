@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
-from ommatid.simulate.lenses.prescription import Prescription, prescription_of
-from ommatid.simulate.lenses.ray_trace import (
+from ommatid.scenes.optics.prescription import Prescription, prescription_of
+from ommatid.scenes.optics.ray_trace import (
     NUMPY,
     Disk,
     exit_disk,

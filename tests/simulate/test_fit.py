@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from ommatid.scenes import model_file
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.view import K1, MAGNIFICATION, ROTATION, misaligned, scales
 from ommatid.scenes.formats.picture import load
-from ommatid.scenes.optics import blur
+from ommatid.scenes.lens_type import LensOptics
+from ommatid.scenes.optics.lens_kernels import blurred_matrix
 from ommatid.scenes.pose import misalignments
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
@@ -142,7 +144,8 @@ def test_pixels_that_lose_light_count_in_rotated_views(seeds: int) -> None:
 def test_what_no_view_explains_is_measured_entry_by_entry() -> None:
     """A blur of one pixel of f in one lens type is no view; the other type's views still explain it."""
     cam = camera((19, 19), THREE[:2])
-    blurred = blur.matrix(cam, cam.types[0], (blur.Blur(disk=1.5), 1.0))
+    lens = replace(cam.types[0], optics=LensOptics(aperture=0.4, focus=0.4 * cam.distance / 1.9))
+    blurred = blurred_matrix(replace(cam, types=(lens, *cam.types[1:])), lens)
     fit = drawn(cam, sparse.csr_array(sparse.vstack([blurred, ideal_matrix(cam)[blurred.shape[0] :]])), RAYS, 0)
     names = {sub.name for sub in cam.sub_imagers if sub.type == cam.types[0]}
     assert set(fit.record["refused"]) == names

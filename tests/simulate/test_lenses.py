@@ -15,11 +15,11 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack as stacks
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
+from ommatid.scenes.optics import sharpness
 from ommatid.scenes.optics.diffraction import pattern
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.lenses import sharpness
 from ommatid.simulate.render import render
 from ommatid.simulate.renderer.plugins import export
 from ommatid.simulate.sensors import response

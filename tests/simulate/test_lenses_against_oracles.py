@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ommatid.scenes.formats.lens_file import read_lens
-from ommatid.simulate.lenses.prescription import Prescription, prescribe
-from ommatid.simulate.lenses.ray_trace import Disk, path, trace
+from ommatid.scenes.optics.prescription import Prescription, prescribe
+from ommatid.scenes.optics.ray_trace import Disk, path, trace
 
 from ..lenses import turned_round
 from .oracle_rays import HEIGHTS, WAVELENGTH, pupil_points

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.special import j0, ndtr
+from scipy.special import ndtr
 
 from ommatid.analysis.summary import describe
 from ommatid.reconstruct.method_choice import choose_method
@@ -15,8 +15,9 @@ from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.optics.blur import Blur
-from ommatid.scenes.optics.radial_density import RadialDensity, diffused, disk_density, panel_nodes
+from ommatid.scenes.optics.lens_matrix import row_by_rays, row_by_waves
+from ommatid.scenes.optics.point_spread import point_spread
+from ommatid.scenes.optics.wavefront import thin_wavefront
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.adaptive_render import render_until
@@ -72,20 +73,24 @@ def test_behind_a_pinhole_h_is_a_product_of_normal_distributions(part: Part, det
     np.testing.assert_allclose(ideal_matrix(camera).toarray(), exact, atol=1e-5 * exact.max())
 
 
-@pytest.mark.parametrize("sigma", [0.05, 0.4, 3.0])
-@pytest.mark.parametrize("name", ["disk", "in focus", "out of focus"])
-def test_transfer_functions_are_multiplied(name: str, sigma: float) -> None:
-    """The Hankel transform of the density is the product of the lens's and of the Gaussian's."""
-    blurs = {"in focus": Blur(airy=0.2), "out of focus": Blur(disk=2.0, airy=0.1)}
-    sharp = disk_density(2.0, 0.1) if name == "disk" else blurs[name].spread_density
+@pytest.mark.parametrize("wavelength", [None, 5.5e-4])
+@pytest.mark.parametrize("focus", [1.0, 0.96])
+def test_transfer_functions_are_multiplied(focus: float, wavelength: float | None) -> None:
+    """The transform of a row is the one without the blur of pixels times a Gaussian's; texels are fine."""
+    wave, width = thin_wavefront(0.4, 2.0, 0.0, 1.0, focus, wavelength, finest=2e-4), 401
+    edges, side = (np.array([188.5, 212.5]),) * 2, 24.0
 
-    def transfer(radial: RadialDensity, frequencies: FloatArray) -> FloatArray:
-        r, weights = panel_nodes(radial.breaks)
-        return j0(2 * np.pi * np.outer(frequencies, r)) @ (weights * radial.density(r))
+    def row(sigma: float) -> FloatArray:
+        blur = sigma / side, sigma / side
+        if wavelength is None:
+            return row_by_rays(wave, 1e-3, edges, blur, (width, width))
+        spread = point_spread(wave)
+        return row_by_waves(spread.values, spread.cell / 1e-3, edges, blur, (width, width))
 
-    k = np.array([0.0, 0.1, 0.3, 0.7])
-    expected = transfer(sharp, k) * np.exp(-2 * np.square(np.pi * sigma * k))
-    np.testing.assert_allclose(transfer(diffused(sharp, sigma), k), expected, atol=1e-5)
+    k = np.array([0.0, 0.005, 0.01, 0.02])
+    waves = np.exp(2j * np.pi * np.outer(k, np.arange(width)))
+    sharp, soft = (np.abs(waves @ row(sigma).sum(axis=1)) for sigma in (0.0, 8.0))
+    np.testing.assert_allclose(soft, sharp * np.exp(-2 * np.square(np.pi * 8.0 * k)), atol=1e-4)
 
 
 @pytest.mark.parametrize("detail", [1, pytest.param(3, marks=SLOW)])

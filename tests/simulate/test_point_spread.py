@@ -14,8 +14,8 @@ from scipy import integrate
 from scipy.special import j0, j1
 
 from ommatid.runtime.errors import InputError
-from ommatid.simulate.lenses.point_spread import density, point_spread, relative_intensity, strehl_ratio
-from ommatid.simulate.lenses.wavefront import GRID_REACH, Wavefront, node_counts, polar_nodes, thin_wavefront
+from ommatid.scenes.optics.point_spread import density, point_spread, relative_intensity, strehl_ratio
+from ommatid.scenes.optics.wavefront import GRID_REACH, Wavefront, node_counts, polar_nodes, thin_wavefront
 
 WAVELENGTH = 5.5e-4
 HALF = 0.1  # sine of the half angle of the cone of light

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.lens_file import read_lens
+from ommatid.scenes.optics.prescription import Prescription, prescribe, prescription_of
 from ommatid.scenes.scene import read, write
 from ommatid.scenes.tables import glass
 from ommatid.scenes.tables.camera import Surface
-from ommatid.simulate.lenses.prescription import Prescription, prescribe, prescription_of
 
 from ..examples import GALLERY
 from ..lenses import BICONVEX, DOUBLE_GAUSS, camera_with, lens, turned_round

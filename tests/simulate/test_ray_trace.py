@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.lens_type import LensOptics
-from ommatid.scenes.scene import read
-from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.lenses import sharpness
-from ommatid.simulate.lenses.etendue import relative_illumination, solid_angles
-from ommatid.simulate.lenses.prescription import Prescription, prescribe, prescription_of
-from ommatid.simulate.lenses.ray_trace import (
+from ommatid.scenes.optics import sharpness
+from ommatid.scenes.optics.etendue import relative_illumination, solid_angles
+from ommatid.scenes.optics.prescription import Prescription, prescribe, prescription_of
+from ommatid.scenes.optics.ray_trace import (
     NUMPY,
     Disk,
     Functions,
@@ -32,7 +30,9 @@ from ommatid.simulate.lenses.ray_trace import (
     through,
     trace,
 )
-from ommatid.simulate.lenses.wavefront import wavefront_of
+from ommatid.scenes.optics.wavefront import wavefront_of
+from ommatid.scenes.scene import read
+from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import GALLERY, needs
 from ..lenses import BICONVEX, DOUBLE_GAUSS, ball, camera_with, lens, turned_round

@@ -12,9 +12,9 @@ import pytest
 
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.lens_file import read_lens
+from ommatid.scenes.optics.field import LensField, field_of
+from ommatid.scenes.optics.point_spread import point_spread, relative_intensity, strehl_ratio
 from ommatid.scenes.scene import parse, read
-from ommatid.simulate.lenses.field import LensField, field_of
-from ommatid.simulate.lenses.point_spread import point_spread, relative_intensity, strehl_ratio
 
 from ..examples import GALLERY
 from ..wave_optics import aberration, aperture_of, relative_light

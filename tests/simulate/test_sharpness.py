@@ -11,10 +11,10 @@ import pytest
 
 from ommatid.analysis.lens_table import lens_rows
 from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.optics import sharpness
+from ommatid.scenes.optics.field import field_of
+from ommatid.scenes.optics.point_spread import point_spread
 from ommatid.scenes.scene import parse, read
-from ommatid.simulate.lenses import sharpness
-from ommatid.simulate.lenses.field import field_of
-from ommatid.simulate.lenses.point_spread import point_spread
 
 from ..examples import GALLERY
 

@@ -10,10 +10,10 @@ import pytest
 
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.optics.etendue import transmission, transmissions
+from ommatid.scenes.optics.prescription import Prescription, prescription_of
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.lenses.etendue import transmission, transmissions
-from ommatid.simulate.lenses.prescription import Prescription, prescription_of
 from ommatid.simulate.sensors import response
 
 from ..conftest import Command

@@ -30,7 +30,6 @@ from scipy import sparse
 from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.optics.blur import blur_of
 from ommatid.scenes.optics.footprints import matrix as footprints
 from ommatid.scenes.pose import Misalignment, pose_of
 
@@ -83,7 +82,7 @@ class MisalignedMoments:
 def tolerances(camera: Camera) -> FloatArray:
     """Return the standard deviations of all parameters: (sub-imagers, 6). Raises InputError for blurred lenses."""
     for lens_type in camera.types:
-        if lens_type.optics.surfaces is not None or not blur_of(camera, lens_type).is_zero:
+        if camera.is_blurred(lens_type):
             raise InputError(
                 f"camera.lens.{lens_type.name}: H of misaligned lenses is known of pinholes and of thin ones in focus"
                 " without a camera.wavelength, got another lens; take estimator.misalignment = 'trust'"

@@ -1,1 +1,1 @@
-"""Closed forms for the light between target and pixel: footprints, blur, distortion, radiometry."""
+"""Light between target and pixel: footprints, rays and waves through lenses, distortion, radiometry."""

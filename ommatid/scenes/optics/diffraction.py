@@ -1,4 +1,4 @@
-"""Diffraction of a circular pupil with defocus: the point-spread function of a thin lens.
+"""Diffraction of a circular pupil with defocus along a radius: what the rays of a thin lens are drawn from.
 
 The wavefront in the pupil is defocused by `waves` wavelengths at its rim. The amplitude at the radius u of the pupil,
 1 at its rim, is 1 / (1 + weight u^2), the square root of the cos^4 law, and the field in the plane of the target is
@@ -14,20 +14,18 @@ u^2) times as large, and the pattern changes, to first order in s, by s cos(angl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from math import ceil, pi, sqrt
 
 import numpy as np
+from scipy.interpolate import CubicSpline, PPoly
 
 from ommatid.runtime.arrays import ComplexArray, FloatArray
 
-from .radial_density import PanelPolynomials, RadialDensity, panel_nodes
-
 TAIL = 0.005  # share of the light beyond the largest v; it falls as 2 / (pi v), so half of it needs twice the radius
-MOST_WAVES = 100.0  # of defocus; beyond, the disk of rays describes the pattern
 QUANTILES = 2**16  # steps of the table of radii, each less than a ring of the pattern
 FEWEST = 2**13  # radii from which quantiles are interpolated
-PANEL = 4.0  # growth of v over a panel
+STEP = 0.1  # of v, between which splines of fields are right to 1e-6 of the largest
 AT_ONCE = 2**22  # Bessel functions
 
 
@@ -35,47 +33,52 @@ AT_ONCE = 2**22  # Bessel functions
 class Pattern:
     """Point-spread function of a circular pupil, normalised to the light of the whole plane.
 
-    breaks : of v, which end where a share of about TAIL is left
-    spread : light per unit of v;  slant : its change per s and unit of v, in the direction of the brighter side
+    fields : U0 and its change per s of v, from 0 to the largest v, beyond which a share of about TAIL is left
+    weight : (aperture / 2 depth)^2
     """
 
-    breaks: FloatArray
-    spread: PanelPolynomials
-    slant: PanelPolynomials
+    fields: CubicSpline[np.complex128]
+    weight: float
 
     @property
     def end(self) -> float:
         """Largest v."""
-        return float(self.breaks[-1])
+        return float(self.fields.x[-1])
+
+    def spread(self, v: FloatArray) -> FloatArray:
+        """Return the light per unit of v."""
+        even, _ = np.moveaxis(self.fields(v), -1, 0)
+        return v * self._light * (even.real**2 + even.imag**2)
+
+    def slant(self, v: FloatArray) -> FloatArray:
+        """Return the change of the light per s and unit of v, in the direction of the brighter side."""
+        even, odd = np.moveaxis(self.fields(v), -1, 0)
+        return 2 * v * self._light * (even.real * odd.imag - even.imag * odd.real)
+
+    @property
+    def _light(self) -> float:
+        return 2 * (1 + self.weight)  # 1 over the integral of u / (1 + weight u^2)^2, by Parseval that of v |U0|^2
+
+    @cached_property
+    def within(self) -> PPoly[np.float64]:
+        """Share of the light within v."""
+        return CubicSpline(self.fields.x, self.spread(self.fields.x)).antiderivative()
 
     @property
     def encircled(self) -> float:
         """Share of the light within the largest v."""
-        return float(self.spread.integral(np.array([self.end]))[0])
+        return float(self.within(self.end))
 
     def quantiles(self, count: int = QUANTILES) -> FloatArray:
         """v that encircle the shares (0, 1/n, ... 1)^2 of the light within the largest v: (count + 1,)."""
         v = np.linspace(0.0, self.end, 2 * max(count, FEWEST) + 1)
-        root = np.sqrt(np.maximum.accumulate(np.maximum(self.spread.integral(v) / self.encircled, 0.0)))
+        root = np.sqrt(np.maximum.accumulate(np.maximum(self.within(v) / self.encircled, 0.0)))
         return np.interp(np.linspace(0.0, 1.0, count + 1), root, v)
 
     def relative_slant(self, v: FloatArray) -> FloatArray:
         """Relative change of the pattern per s at v, in the direction of the brighter side."""
         light = self.spread(v)
         return np.divide(self.slant(v), light, out=np.zeros_like(light), where=light > 0)
-
-    def spread_density(self, airy: float) -> RadialDensity:
-        """Density of displacements, where `airy` is the length of v = 1."""
-        return RadialDensity(self.breaks * airy, lambda r: self.spread(r / airy) / airy, self.encircled)
-
-    def slant_density(self, airy: float) -> RadialDensity:
-        """The isotropic density whose derivative along an axis is the change per s towards that axis."""
-        nodes, weights = panel_nodes(self.breaks)
-        # The slant is 2 pi v k(v), k cos(angle) the change; the density is 2 pi v times minus the integral of k beyond.
-        per_v = PanelPolynomials(self.breaks, self.slant(nodes) / nodes)
-        values = -nodes * (per_v.integral(np.array([self.end])) - per_v.integral(nodes))
-        kernel = PanelPolynomials(self.breaks, values)
-        return RadialDensity(self.breaks * airy, lambda r: kernel(r / airy), airy * float(weights @ values))
 
 
 def end_of(waves: float) -> float:
@@ -91,13 +94,8 @@ def pattern(waves: float, weight: float = 0.0) -> Pattern:
     weight : (aperture / 2 depth)^2
     """
     end = end_of(waves)
-    breaks = np.linspace(0.0, end, ceil(end / PANEL) + 1)
-    v, _ = panel_nodes(breaks)
-    even, odd = _fields(v, waves, weight)
-    whole = 1 / (2 * (1 + weight))  # integral of u / (1 + weight u^2)^2, which by Parseval is that of v |U0|^2
-    spread = v * (even.real**2 + even.imag**2) / whole
-    slant = 2 * v * (even.real * odd.imag - even.imag * odd.real) / whole
-    return Pattern(breaks, PanelPolynomials(breaks, spread), PanelPolynomials(breaks, slant))
+    v = np.linspace(0.0, end, ceil(end / STEP) + 1)
+    return Pattern(CubicSpline(v, np.stack(_fields(v, waves, weight), axis=-1)), weight)
 
 
 def _fields(v: FloatArray, waves: float, weight: float) -> tuple[ComplexArray, ComplexArray]:

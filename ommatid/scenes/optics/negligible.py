@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache
 from math import ceil, floor, hypot
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import sparse, special
@@ -22,9 +22,7 @@ from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
 from ..lens_type import LensType
 from ..scene import Scene
 from ..tables.estimation import PriorTable
-
-if TYPE_CHECKING:
-    from .blur import Blur
+from .boxes import designed_box
 
 MOST_DISK = 1 / 20  # pixels of f, diameter of a negligible disk of defocus
 MOST_AIRY = 1 / 5  # sensor pixels, diameter of a negligible Airy disk, to its first dark ring
@@ -114,8 +112,6 @@ def _negligible_diffraction(
     camera: Camera, wavelength: float, prior: PriorTable, allowed: float
 ) -> SkippedEffect | None:
     """The skipped diffraction, or None if at least one lens type needs it."""
-    from .blur import blur_of
-
     widest = most = 0.0
     for lens_type in camera.types:
         if lens_type.optics.surfaces is not None:
@@ -126,7 +122,7 @@ def _negligible_diffraction(
         disk = disk / camera.pixel_pitch
         if disk >= MOST_AIRY:
             return None
-        change, mean_square = _change(camera, lens_type, replace(blur_of(camera, lens_type), airy=0.0), prior)
+        change, mean_square = _change(camera, replace(camera, wavelength=None), lens_type, lens_type, prior)
         if mean_square > allowed:
             return None
         widest, most = max(widest, disk), max(most, change)
@@ -142,47 +138,59 @@ def _negligible_aperture(
         return None
     if camera.tolerance is not None and (camera.tolerance.focal_length or camera.tolerance.tilt):
         return None  # both defocus sub-imagers
-    from .blur import Blur, blur_of
-
-    blur = blur_of(camera, lens_type)
+    disk = lens_type.optics.aperture * abs(1 - camera.distance_of(lens_type) / camera.focus(lens_type))
+    disk /= camera.target_pitch
     what = f"samples of the aperture of lens type {lens_type.name}"
     falloff = _illumination_change(camera, lens_type)
-    if blur.disk == 0:
+    if disk == 0:
         if prior.variance * (falloff / float(lens_type.ratio)) ** 2 > allowed:  # m^2 entries of 1/m^2 change by falloff
             return None
         return SkippedEffect(what, "it is in focus: all rays of a sensor point meet on the target", WHITE / 2 * falloff)
-    if blur.disk >= MOST_DISK:
+    if disk >= MOST_DISK:
         return None
-    change, mean_square = _change(camera, lens_type, Blur(diffusion=blur.diffusion), prior)
+    pinhole = replace(lens_type, optics=replace(lens_type.optics, aperture=None, focus=None))
+    change, mean_square = _change(camera, camera, lens_type, pinhole, prior)
     if mean_square > allowed:
         return None
-    why = f"the disk of defocus is {blur.disk:.2g} pixels of f wide, and its effect is far below the noise"
+    why = f"the disk of defocus is {disk:.2g} pixels of f wide, and its effect is far below the noise"
     return SkippedEffect(what, why, change + WHITE / 2 * falloff)
 
 
-def _change(camera: Camera, lens_type: LensType, reduced: Blur, prior: PriorTable) -> tuple[float, float]:
-    """Change of a measurement, far from the target's edges and at its corner, if the blur is reduced to `reduced`.
+def _change(
+    camera: Camera, other_camera: Camera, lens_type: LensType, other_type: LensType, prior: PriorTable
+) -> tuple[float, float]:
+    """Change of a measurement, far from the target's edges and at its corner, in the other camera by the other type.
 
     Returns the largest change for values from 0 to 255, and the larger mean square for images of the prior. At the
     corner rays miss the target, so that a row of H changes its sum, and sees less of the prior's mean.
     """
-    from .blur import blurs_of, matrix
+    from .field import light_reach
 
-    blurs = blurs_of(camera, lens_type)
-    margin = ceil(max(blur.reach for blur, _ in blurs)) + 1
+    margin = ceil(light_reach(camera, lens_type)) + 1
     nearest = (floor(min(start, end)) for start, end in lens_type.gaps(camera.shape))
     largest = mean_square = 0.0
     for origin in ((margin, margin), tuple(min(max(gap, 0), margin) for gap in nearest)):
         rows, columns = (start + ceil(lens_type.ratio) + 1 + margin for start in origin)
-        single = replace(lens_type, array=(1, 1), pixels=(1, 1), origin=origin, left=None)
-        small = replace(camera, rows=rows, columns=columns, types=(single,), lens_columns=None)
-        row = sparse.csr_array(matrix(small, single, *blurs) - matrix(small, single, (reduced, 1.0))).data
+        matrices: list[sparse.csr_array] = []
+        for each, its_type in ((camera, lens_type), (other_camera, other_type)):
+            single = replace(its_type, array=(1, 1), pixels=(1, 1), origin=origin, left=None)
+            small = replace(each, rows=rows, columns=columns, types=(single,), lens_columns=None)
+            matrices.append(_designed(small, single))
+        row = sparse.csr_array(matrices[0] - matrices[1]).data
         lost, squares = float(row.sum()) ** 2, float(np.square(row).sum())
         if prior.kind != "independent":
             squares = max(squares, lost)  # of neighbours that are all alike
         largest = max(largest, WHITE * float(row[row > 0].sum()), -WHITE * float(row[row < 0].sum()))
         mean_square = max(mean_square, prior.mean**2 * lost + prior.variance * squares)
     return largest, mean_square
+
+
+def _designed(camera: Camera, lens_type: LensType) -> sparse.csr_array:
+    if not camera.is_blurred(lens_type):
+        return designed_box(camera.shape, lens_type).to_sparse()
+    from .lens_kernels import blurred_matrix
+
+    return blurred_matrix(camera, lens_type)
 
 
 @cache
@@ -204,16 +212,22 @@ def change_by_diffraction(camera: Camera, lens_type: LensType, aperture: float, 
 
     The light that leaves a sensor pixel's footprint with diffraction, and without it by defocus. Both lengths in mm.
     """
-    from .blur import MOST_WAVES, Blur, transfer
+    from .field import MOST_RINGS
+    from .lens_matrix import row_by_rays, row_by_waves
+    from .point_spread import point_spread
+    from .wavefront import thin_wavefront
 
-    footprint = float(lens_type.ratio) * camera.target_pitch
-    disk = aperture * abs(1 - camera.distance_of(lens_type) / focus) / footprint
-    airy = GREEN * camera.distance_of(lens_type) / np.pi / (aperture * footprint)
-    waves, rays = Blur(disk, airy), Blur(disk)
-    if waves.waves > MOST_WAVES:
-        waves = rays
-    kept = [float(transfer((1.0, 1.0), np.array([0]), 1, blur)[0, 0]) for blur in (waves, rays)]
-    return WHITE * min(1.0, sum(1 - share for share in kept))
+    distance, footprint = camera.distance_of(lens_type), float(lens_type.ratio) * camera.target_pitch
+    edges, shape, sharp = (np.array([0.0, 1.0]),) * 2, (1, 1), (0.0, 0.0)
+    rays, wave = (
+        thin_wavefront(aperture, camera.depth(lens_type), 0.0, distance, focus, wavelength)
+        for wavelength in (None, GREEN)
+    )
+    kept = [row_by_rays(rays, footprint, edges, sharp, shape)] * 2
+    if rays.spot_radius < MOST_RINGS * wave.resolution:
+        spread = point_spread(wave)
+        kept[0] = row_by_waves(spread.values, spread.cell / footprint, edges, sharp, shape)
+    return WHITE * min(1.0, sum(1 - float(share[0, 0]) for share in kept))
 
 
 def _illumination_change(camera: Camera, lens_type: LensType) -> float:

@@ -193,9 +193,9 @@ def lens_of(camera: Camera, lens_type: LensType) -> LensModel:
     if aperture is None:
         return LensModel(camera, lens_type)
     if camera.wavelengths:
-        from ommatid.scenes.optics.blur import blurs_of
+        from ommatid.scenes.optics.field import field_of
 
-        if any(blur.airy for blur, _ in blurs_of(camera, lens_type)):  # not so far out of focus that light is rays
+        if not all(field_of(camera, lens_type, wavelength).rays_suffice for wavelength, _ in camera.wavelengths):
             from .diffracting_lens import DiffractingLens
 
             return DiffractingLens(camera, lens_type, aperture)

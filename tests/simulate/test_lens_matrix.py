@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy import sparse, stats
 
+from ommatid.scenes.optics.field import TOLERANCE, field_of
+from ommatid.scenes.optics.point_spread import density, grid_of, point_spread
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.responses import measured
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.lenses.field import TOLERANCE, field_of
-from ommatid.simulate.lenses.point_spread import density, grid_of, point_spread
 
 from ..examples import familywise, needs
 from .test_lenses import built

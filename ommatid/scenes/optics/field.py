@@ -1,6 +1,7 @@
 """What one lens type does over its field: where rays go, how much light passes, and how points blur.
 
-A kind of lens is a class that yields the wave of a sensor point: `ThinField` and `SurfaceField`. All else follows.
+A kind of lens is a class that yields the wave of a sensor point: `ThinField` and `SurfaceField`. All else follows. A
+pinhole whose pixels blur is a thin lens in focus, through which light goes as rays.
 Lengths are millimetres, in the coordinates of the lens. The lens is round, so that everything depends on the height of
 the sensor point above the axis; point-spread functions turn with its direction. They are computed at nodes of height,
 as many as linear interpolation between them needs.
@@ -19,9 +20,10 @@ from scipy.interpolate import CubicSpline
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.lens_type import LensType
 
+from ..camera import Camera
+from ..constants import DEVIATIONS
+from ..lens_type import LensType
 from .point_spread import grid_of, point_spread
 from .prescription import Prescription, prescribe, prescription_of
 from .ray_trace import Disk, exit_disk, reach
@@ -34,6 +36,10 @@ MOST_WIDER = 2.0  # ratio of the widths of a common grid and of the narrowest th
 LEAST_VERGENCE = 1e-9  # of a far target; that of 0 has no plane
 MOST_ABERRATED = 2.0  # spot of rays in disks of defocus, up to which it is that of defocus
 MOST_RINGS = 100.0  # spots of more than so many `resolution`s are computed by rays alone
+FINEST = 1 / 6  # pixels of f, shortest period that the rays of a row of H resolve
+MOST_REACH = 1000  # pixels of f
+FASTEST = 0.5  # ratio of length to width of a cone of light in air
+PINHOLE = 1e-3  # of the depth: an aperture in its place, in focus
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +67,11 @@ class LensField(ABC):
         half : of the width of the grid that the wave's nodes serve, where it is wider than that of its own
         """
 
+    def rays(self, height: float, finest: float) -> Wavefront:
+        """Return the rays of a sensor point that gets light, as many as resolve a period on the target."""
+        del finest
+        return _lit(self.wave(height, None), height)
+
     @cached_property
     def _rays(self) -> tuple[FloatArray, list[Wavefront]]:
         """Heights that get light, the least of them 0, and their rays."""
@@ -87,6 +98,12 @@ class LensField(ABC):
         """Return the light at sensor points as a projected solid angle, sr; 0 where none arrives."""
         heights, waves = self._rays
         return np.interp(height, heights, [wave.brightness for wave in waves], right=0.0)
+
+    @property
+    def reach(self) -> float:
+        """How far from its centre the light of a sensor point is computed."""
+        spot = max(wave.spot_radius for wave in self._rays[1])
+        return spot if self.rays_suffice else max(spot, self.grid[1])
 
     @property
     def pupil_radius(self) -> float:
@@ -224,6 +241,10 @@ class ThinField(LensField):
         """Compute the wave, whose phase is quadratic; see `LensField.wave`."""
         return thin_wavefront(self.aperture, self.depth, height, self.distance, self.focus, wavelength, half)
 
+    def rays(self, height: float, finest: float) -> Wavefront:
+        """Return the rays of a sensor point; see `LensField.rays`."""
+        return thin_wavefront(self.aperture, self.depth, height, self.distance, self.focus, None, finest=finest)
+
 
 def _lit(wave: Wavefront | None, height: float) -> Wavefront:
     if wave is None:
@@ -288,13 +309,37 @@ def bands(camera: Camera) -> tuple[tuple[float | None, float], ...]:
     return camera.wavelengths or ((None, 1.0),)
 
 
+def light_reach(camera: Camera, lens_type: LensType) -> float:
+    """Return how far light reaches beyond a pixel's footprint, in pixels of f.
+
+    Raises InputError for more than can be computed, and as `field_of` does.
+    """
+    far = max(field_of(camera, lens_type, wavelength).reach for wavelength, _ in bands(camera)) / camera.target_pitch
+    far += DEVIATIONS * camera.diffusion(lens_type)
+    if far > MOST_REACH:
+        raise InputError(
+            f"camera.lens.{lens_type.name}: its blur reaches {far:.3g} pixels of f, expected at most {MOST_REACH};"
+            " change its aperture or its focus"
+        )
+    return far
+
+
+@lru_cache(maxsize=32)
 def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> LensField:
-    """Return a lens type of the camera, which is no pinhole, at a wavelength. Raises as `surface_field` does."""
+    """Return a lens type of the camera at a wavelength.
+
+    Raises InputError for a cone of light that no lens in air forms, and as `surface_field` does.
+    """
     if lens_type.optics.surfaces is not None:
         return surface_field(camera, lens_type, wavelength)
-    if lens_type.optics.aperture is None:
-        raise ValueError(f"lens type '{lens_type.name}' is a pinhole, expected a lens")
     depth, (far, _, _), aperture = camera.depth(lens_type), reach(camera, lens_type), lens_type.optics.aperture
+    if aperture is None:
+        aperture, wavelength = PINHOLE * depth, None
+    elif depth / aperture < FASTEST:
+        raise InputError(
+            f"camera.lens.{lens_type.name}.aperture: expected a cone of light of f/{FASTEST:g} at the sensor or"
+            f" narrower, the limit of lenses in air, got f/{depth / aperture:.2g}; make the aperture smaller"
+        )
     return ThinField(
         depth=depth,
         distance=camera.distance_of(lens_type),

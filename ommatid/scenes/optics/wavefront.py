@@ -33,6 +33,8 @@ EDGE_STEPS, PARTS = 8, 16  # of the search for the edge, each of which divides a
 STEP = 1e-6  # of differences, relative to the disk
 BESIDE_RIM = 1.001  # rims are so much wider for rays that the differences trace
 RAY_NODES = (48, 96)  # along the radius and around, where no wave oscillates over the pupil
+GOLDEN = (sqrt(5) - 1) / 2
+MOST_OSCILLATIONS = 600.0  # over the radius of the spot, of what rays resolve
 FEWEST = (16, 32)
 MOST_NODES = 2**22
 GRID_REACH = 40.0  # in units of `resolution`: a grid of a point-spread function extends so far beyond the spot of rays
@@ -134,18 +136,23 @@ def thin_wavefront(
     focus: float,
     wavelength: float | None,
     half: float = 0.0,
+    finest: float | None = None,
 ) -> Wavefront:
     """Return the wave of the sensor point (0, height) behind a thin lens that is focused at `focus`.
 
-    distance, half : as of `wavefront_of`
+    distance, half : as of `wavefront_of`;  finest : shortest period on the target that rays alone resolve
     """
     spot, counts = aperture / 2 * abs(1 - distance / focus), RAY_NODES
+    if finest is not None:
+        counts = node_counts(1.0, min(spot / finest, MOST_OSCILLATIONS), 0.0)
     if wavelength is not None:
         unit = wavelength * abs(distance) / aperture
         counts = node_counts(0.5 / unit, spot, max(half, spot + GRID_REACH * unit))
     radius, angle, area = polar_nodes(counts)
+    if wavelength is None:
+        angle = angle + 2 * pi / counts[1] * ((GOLDEN * np.arange(counts[0])[:, None]) % 1)
     at = aperture / 2 * (radius * np.stack([np.cos(angle), np.sin(angle)])).reshape(2, -1)
-    share = np.broadcast_to(area, (radius.size, angle.size)).ravel() * (aperture / 2) ** 2
+    share = np.broadcast_to(area, counts).ravel() * (aperture / 2) ** 2
     light = share / (1 + (at[0] ** 2 + (at[1] - height) ** 2) / depth**2) ** 2
     brightness = float(light.sum()) / depth**2
     light /= light.sum()

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
-from ommatid.scenes.geometry.optical_terms import ThroughFocus
-from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics import distortion
 
+from ..camera import Camera
+from ..constants import AIRY_FIRST_ZERO, GREEN
+from ..geometry.optical_terms import ThroughFocus
+from ..lens_type import LensType
+from . import distortion
 from .field import LEAST_VERGENCE, LensField, field_of
 from .point_spread import grid_of, point_spread, strehl_ratio
 from .wavefront import Wavefront

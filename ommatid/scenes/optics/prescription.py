@@ -18,11 +18,12 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.constants import GREEN
-from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.tables import glass
-from ommatid.scenes.tables.camera import Surface
+
+from ..camera import Camera
+from ..constants import GREEN
+from ..lens_type import LensType
+from ..tables import glass
+from ..tables.camera import Surface
 
 
 class Pupil(NamedTuple):

@@ -1,4 +1,4 @@
-"""H of lenses with surfaces: the point-spread functions of traced waves, integrated over sensor pixels and pixels of f.
+"""H of blurred lens types: the point-spread functions of waves, integrated over sensor pixels and pixels of f.
 
 Lengths are pixels of f. An entry is the mean of overlap(y, dy) overlap(x, dx) over the displacements (dx, dy) of the
 point-spread function, where overlap is the share of the footprint [a, b] + d along an axis that lies in the texel. The
@@ -14,7 +14,7 @@ point-spread functions are convolved on their grid. Its deviation is in proporti
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import groupby
@@ -26,13 +26,15 @@ from scipy.special import ndtr, sici
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.machine import check_memory
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.constants import DEVIATIONS
-from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.pose import corner_offset, pose_of
 
+from ..camera import Camera
+from ..constants import DEVIATIONS
+from ..lens_type import LensType
+from ..pose import corner_offset, pose_of
 from .field import LensField, bands, check_waves, field_of
+from .wavefront import Wavefront
 
+SAME = 6  # digits of edges of footprints, which pixels of a row share
 LEAST = 1e-12  # entries below are left out
 ENTRY = 16  # bytes
 
@@ -54,7 +56,7 @@ class _PixelFootprints:
 
 @lru_cache(maxsize=4)
 def matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
-    """H of all sub-imagers of a lens type with surfaces, as designed: (its measurements, N).
+    """H of all sub-imagers of a lens type, as designed, pixel by pixel: (its measurements, N).
 
     A row holds the light of a pixel that comes from the target: less than 1, as diffraction takes up to 0.5 per cent
     of the light beyond the grid of the point-spread function. Rows of pixels without light are empty. Neglected is the
@@ -108,11 +110,10 @@ def blur_of(camera: Camera, lens_type: LensType) -> tuple[float, float]:
 
 def _rows(camera: Camera, field: LensField, pixels: _PixelFootprints) -> sparse.csr_array:
     count = pixels.x.size
-    wide = max(field.grid[1] if not field.rays_suffice else 0.0, max(wave.spot_radius for wave in field.nodes[1]))
     own = float(np.ptp(pixels.rows[0])) * (1 + 2 * DEVIATIONS * pixels.blur[0])
-    side = [min(size, own + 2 * wide / camera.target_pitch + 2) for size in camera.shape]
+    side = [min(size, own + 2 * field.reach / camera.target_pitch + 2) for size in camera.shape]
     needed = int(count * side[0] * side[1]) * ENTRY
-    check_memory(needed, "H of a lens with surfaces", "crop the target or use fewer sub-imagers")
+    check_memory(needed, "H of blurred pixels", "crop the target or use fewer sub-imagers")
     rows: list[sparse.csr_array] = [sparse.csr_array((1, camera.unknowns))] * count
     lit = np.flatnonzero(field.brightness(np.hypot(pixels.x, pixels.y)) > 0)
     by_points = _by_rays if field.rays_suffice else _by_waves
@@ -128,12 +129,10 @@ def _by_rays(
     """Compute the entries, (rows, columns) of f, of each lit pixel from the rays of the nodes beside its height."""
     for pixel in lit.tolist():
         x, y = float(pixels.x[pixel]), float(pixels.y[pixel])
-        values = np.zeros(camera.shape)
+        values, edges = np.zeros(camera.shape), (pixels.rows[pixel], pixels.columns[pixel])
         for wave, share in field.between(float(np.hypot(x, y))):
-            across, up = wave.turned(float(np.arctan2(-x, y))).hits / camera.target_pitch
-            down = overlaps(pixels.rows[pixel], -up, camera.rows, blur=pixels.blur[0])
-            beside = overlaps(pixels.columns[pixel], -across, camera.columns, blur=pixels.blur[1])
-            values += (down * (share * wave.light)[:, None]).T @ beside
+            turned = wave.turned(float(np.arctan2(-x, y)))
+            values += share * row_by_rays(turned, camera.target_pitch, edges, pixels.blur, camera.shape)
         yield pixel, values
 
 
@@ -163,26 +162,64 @@ def _key(field: LensField, x: float, y: float) -> tuple[int, int]:
     return round(angle / (pi / 2) * turns), round(float(np.hypot(x, y)) / field.field * levels)
 
 
-def overlaps(edges: FloatArray, offsets: FloatArray, size: int, cell: float = 0.0, blur: float = 0.0) -> FloatArray:
+def overlaps(edges: FloatArray, offsets: FloatArray, size: int, cell: float) -> FloatArray:
     """Return the share of the interval between two edges, moved by each offset, in each texel: (n, size).
 
-    cell : spacing of the offsets, whose frequencies are left out; 0: none
-    blur : standard deviation of a Gaussian by which it is moved in addition, over its length, where no cell is given
+    cell : spacing of the offsets, whose frequencies are left out
     """
+    rate = pi / cell
+
+    def integral(t: FloatArray) -> FloatArray:
+        return (t * sici(rate * t)[0] + np.cos(rate * t) / rate) / pi
+
+    return _shares(edges, offsets[:, None] - np.arange(size + 1), integral)
+
+
+def _shares(edges: FloatArray, offsets: FloatArray, integral: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Return the second differences of B, `integral`, over an interval and over the texels that offsets divide."""
     low, high = edges.min(), edges.max()
-    texels = np.arange(size + 1)
-    upper, lower = (_integral(edge + offsets[:, None] - texels, cell, blur * (high - low)) for edge in (high, low))
+    upper, lower = integral(high + offsets), integral(low + offsets)
     return (upper[:, :-1] - upper[:, 1:] + lower[:, 1:] - lower[:, :-1]) / (high - low)
 
 
-def _integral(t: FloatArray, cell: float, deviation: float) -> FloatArray:
-    if cell:
-        rate = pi / cell
-        return (t * sici(rate * t)[0] + np.cos(rate * t) / rate) / pi
-    if deviation:
+def ray_overlaps(edges: FloatArray, offsets: FloatArray, size: int, deviation: float) -> sparse.csr_array:
+    """Return the share of the interval between two edges, moved by each offset, in each texel: (n, size).
+
+    deviation : of a Gaussian by which it is moved in addition, or 0
+    """
+    low, high, beside = edges.min(), edges.max(), DEVIATIONS * deviation
+    first: FloatArray = np.floor(low - beside + offsets)[:, None]
+    count = ceil(high - low + 2 * beside) + 1
+    cells: IntArray = first.astype(np.intp) + np.arange(count)
+
+    def integral(t: FloatArray) -> FloatArray:
+        if deviation == 0:
+            return np.abs(t) / 2
         at = t / deviation
         return t * (ndtr(at) - 0.5) + deviation / np.sqrt(2 * pi) * np.exp(-np.square(at) / 2)
-    return np.abs(t) / 2
+
+    shares = _shares(edges, offsets[:, None] - first - np.arange(count + 1), integral)
+    inside = (cells >= 0) & (cells < size)
+    starts = np.concatenate([[0], np.cumsum(inside.sum(axis=1))])
+    return sparse.csr_array((shares[inside], cells[inside], starts), shape=(offsets.size, size))
+
+
+def row_by_rays(
+    wave: Wavefront, pitch: float, edges: Sequence[FloatArray], blur: tuple[float, float], shape: tuple[int, int]
+) -> FloatArray:
+    """Return the entries, (rows, columns) of f, of a pixel whose light is rays. pitch : of f;  see `row_by_waves`."""
+    down, beside = (
+        ray_overlaps(each, -moved / pitch, size, part * float(np.ptp(each)))
+        for each, moved, part, size in zip(edges, wave.hits[::-1], blur, shape, strict=True)
+    )
+    return np.asarray(((sparse.diags_array(wave.light) @ down).T @ beside).toarray(), dtype=np.float64)
+
+
+@lru_cache(maxsize=256)
+def _cell_overlaps(low: float, high: float, count: int, size: int, cell: float) -> FloatArray:
+    """Return `overlaps` of the cells of a point-spread function, once for all pixels of a sensor row or column."""
+    offsets = cell * (np.arange(count, dtype=np.float64) - count // 2)
+    return overlaps(np.array([low, high]), -offsets, size, cell)
 
 
 def row_by_waves(
@@ -196,6 +233,7 @@ def row_by_waves(
         deviations = [part * float(np.ptp(each)) / cell for part, each in zip(blur, edges, strict=True)]
         moved = fft.fft2(np.pad(spread, ceil(DEVIATIONS * max(deviations))))
         spread = fft.ifft2(ndimage.fourier_gaussian(moved, deviations)).real
-    offsets = cell * (np.arange(len(spread), dtype=np.float64) - len(spread) // 2)
-    down, beside = (overlaps(each, -offsets, size, cell) for each, size in zip(edges, shape, strict=True))
+    (low, high), (left, right) = (np.sort(each).round(SAME) for each in edges)
+    down = _cell_overlaps(float(low), float(high), len(spread), shape[0], cell)
+    beside = _cell_overlaps(float(left), float(right), len(spread), shape[1], cell)
     return np.asarray(down.T @ spread @ beside, dtype=np.float64)

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.pose import corner_offset, poses
 
+from ..camera import Camera
+from ..pose import corner_offset, poses
 from .field import LensField, field_of
 from .prescription import Prescription, prescription_of
 

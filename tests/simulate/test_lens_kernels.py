@@ -12,13 +12,13 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes import model_file
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.lens_type import LensType
+from ommatid.scenes.optics import lens_kernels, lens_matrix
 from ommatid.scenes.scene import Scene, read
 from ommatid.simulate.ideal import ideal_model
-from ommatid.simulate.lenses import surface_kernels, surface_matrix
 
 from ..examples import GALLERY
 from ..lenses import camera_with
-from .test_surface_matrix import BENT
+from .test_lens_matrix import BENT
 
 ENTRY = 1e-3  # error of an entry relative to the largest
 
@@ -45,8 +45,8 @@ def test_kernels_are_the_entries(name: str, lenses: list[str], detail: int) -> N
     """On and off the axis, on f's grid and on the world's."""
     camera = derive(large(name, 19, lenses, detail)).world
     for lens_type in camera.types:
-        expected = surface_matrix.matrix(camera, lens_type)
-        found = surface_kernels.kernels(camera, lens_type).to_sparse()
+        expected = lens_matrix.matrix(camera, lens_type)
+        found = lens_kernels.kernels(camera, lens_type).to_sparse()
         assert abs(found - expected).max() < ENTRY * expected.max()
         assert abs(found.sum(axis=1) - expected.sum(axis=1)).max() < ENTRY / 5
 
@@ -69,8 +69,8 @@ def corner(camera: Camera, lens_type: LensType, back: tuple[int, int] = (2, 2)) 
 def test_kernels_at_the_corner_of_a_large_field(name: str, size: int) -> None:
     camera = derive(large(name, size, ["I"]))
     (lens_type,) = camera.types
-    found = surface_kernels.kernels(camera, lens_type).rows(np.array([lens_type.measurements - 1]))
-    expected = surface_matrix.matrix(*corner(camera, lens_type))[[3]]
+    found = lens_kernels.kernels(camera, lens_type).rows(np.array([lens_type.measurements - 1]))
+    expected = lens_matrix.matrix(*corner(camera, lens_type))[[3]]
     assert abs(found - expected).max() < ENTRY * expected.max()
 
 
@@ -80,11 +80,11 @@ def test_kernels_between_their_nodes_near_the_corner_of_a_large_field() -> None:
     shape = ["target.shape=[239,239]", "target.origin=[0,0]", "target.detail=1", 'camera.lens_pitch="3.15 mm"']
     camera = derive(read(GALLERY / "doublet119.toml", shape))
     lens_type = camera.types[0]
-    kernels, (_, across) = surface_kernels.kernels(camera, lens_type), lens_type.pixels
+    kernels, (_, across) = lens_kernels.kernels(camera, lens_type), lens_type.pixels
     for back in ((3, 3), (3, 10), (3, 26), (2, 30)):
         pixel = lens_type.measurements - (back[0] - 1) * across - back[1]
         found = kernels.rows(np.array([pixel]))
-        expected = surface_matrix.matrix(*corner(camera, lens_type, back))[[0]]
+        expected = lens_matrix.matrix(*corner(camera, lens_type, back))[[0]]
         assert abs(found - expected).max() < 3e-3 * expected.max()
 
 
@@ -110,4 +110,4 @@ def test_distortion_that_kernels_do_not_hold_is_named() -> None:
     camera = camera_with(BENT)
     wide = replace(camera.types[0], pixels=(160, 160), array=(1, 1), origin=(-240, -240))
     with pytest.raises(InputError, match="displaced and blurred over the field by more than kernels hold"):
-        surface_kernels.kernels(replace(camera, types=(wide,)), wide)
+        lens_kernels.kernels(replace(camera, types=(wide,)), wide)

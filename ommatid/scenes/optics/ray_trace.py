@@ -27,10 +27,10 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.pose import poses
 
+from ..camera import Camera
+from ..lens_type import LensType
+from ..pose import poses
 from .prescription import Prescription
 
 Direction = tuple[Any, Any, Any]

@@ -1,4 +1,4 @@
-"""Kernels of lenses with surfaces as designed: the rows of `surface_matrix` as polynomials of the field.
+"""Kernels of blurred lens types as designed: the rows of H as polynomials of the field.
 
 Rows are computed at a chart of field positions, nodes of Gauss and Legendre in a quadrant. A lens is round, so that the
 other quadrants mirror it. Least squares give each cell's polynomial of the lowest degree that serves, and the cells
@@ -14,23 +14,24 @@ from itertools import product
 from math import ceil
 
 import numpy as np
+from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import check_memory
-from ommatid.scenes.camera import Camera
-from ommatid.scenes.constants import DEVIATIONS
-from ommatid.scenes.fitted.kernel_shapes import KernelShapes
-from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces, basis, terms
-from ommatid.scenes.lens_type import LensType
 
-from .field import LensField, bands, check_waves, field_of
+from ..camera import Camera
+from ..fitted.kernel_shapes import KernelShapes
+from ..fitted.kernels import KernelFootprints, KernelPlaces, basis, terms
+from ..lens_type import LensType
+from .field import FINEST, LensField, bands, check_waves, field_of, light_reach
+from .lens_matrix import blur_of, matrix, row_by_rays, row_by_waves
 from .point_spread import point_spread
-from .surface_matrix import blur_of, overlaps, row_by_waves
 
-CHARTS = {3: (2, 4), 5: (6,), 7: (8, 10), 12: (12, 14, 16)}  # nodes along a side of a quadrant, degrees for them
+# Nodes along a side of a quadrant, and degrees for them.
+CHARTS = {1: (0, 1), 3: (2, 4), 5: (6,), 7: (8, 10), 12: (12, 14, 16)}
 HIGHEST = 16
-BETWEEN = 4  # nodes along a side, those of no chart, at which the polynomials are tried
+BETWEEN = 2, 4  # nodes along a side, those of no chart, at which polynomials of the first chart and of others are tried
 TOLERANCE = 1e-3  # error of an entry, relative to the largest of its row, with which a degree is enough,
 MOST = 3e-3  # and with which the highest is: where light begins to be cut off by a rim, polynomials serve less
 SHARE = 0.5  # of it that leaving out components may take
@@ -63,22 +64,14 @@ class _FieldRows:
         return camera.target_pitch * camera.optical_magnification(self.places.lens_type)
 
     def _row(self, field: LensField, x: float, y: float, beside: FloatArray) -> FloatArray:
-        camera, wide = self.places.camera, self.places.width
-        edges = _edges(camera, field, x, y, self.places.lens_type) - (beside - wide / 2)[:, None]
-        blur = blur_of(camera, self.places.lens_type)
-        angle, height = float(np.arctan2(-x, y)), float(np.hypot(x, y))
+        camera, lens_type, wide = self.places.camera, self.places.lens_type, self.places.width
+        edges = tuple(_edges(camera, field, x, y, lens_type) - (beside - wide / 2)[:, None])
+        blur, pitch, height = blur_of(camera, lens_type), camera.target_pitch, float(np.hypot(x, y))
+        angle = float(np.arctan2(-x, y))
         if field.rays_suffice:
-            total = np.zeros((wide, wide))
-            for wave, share in field.between(height):
-                across, up = wave.turned(angle).hits / camera.target_pitch
-                down, beside = (
-                    overlaps(each, -moved, wide, blur=part)
-                    for each, moved, part in zip(edges, (up, across), blur, strict=True)
-                )
-                total += (down * (share * wave.light)[:, None]).T @ beside
-            return total
+            return row_by_rays(field.rays(height, FINEST * pitch).turned(angle), pitch, edges, blur, (wide, wide))
         spread = point_spread(field.lit_wave(height).turned(angle), field.grid)
-        return row_by_waves(spread.values, spread.cell / camera.target_pitch, tuple(edges), blur, (wide, wide))
+        return row_by_waves(spread.values, spread.cell / pitch, edges, blur, (wide, wide))
 
     def chart(self, nodes: FloatArray, *, ends: bool) -> tuple[FloatArray, FloatArray]:
         """Return pairs of u and v in a quadrant, (pairs, 2), and the rows there, (pairs, W^2).
@@ -106,10 +99,10 @@ def _edges(camera: Camera, field: LensField, x: float, y: float, lens_type: Lens
 
 @lru_cache(maxsize=16)
 def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
-    """H of a lens type with surfaces as designed, as of `surface_matrix.matrix`, by a few kernels.
+    """H of a blurred lens type as designed, as of `lens_matrix.matrix`, by a few kernels.
 
-    Expects a camera for which `Camera.has_kernel` is true. Raises InputError if the surfaces form no image, or kernels
-    do not hold the variation over the field to the tolerance.
+    Expects a camera for which `Camera.has_kernel` is true. Raises InputError if surfaces form no image, if kernels do
+    not hold the variation over the field to the tolerance, and as `light_reach` does.
     """
     fields = tuple((field_of(camera, lens_type, wavelength), weight) for wavelength, weight in bands(camera))
     for field, _ in fields:
@@ -119,13 +112,16 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
     check_memory(
         COPIES * 8 * cells * (1 + max(CHARTS)) ** 2, f"the kernels of lens type {lens_type.name}", "crop the target"
     )
-    worst, (between, expected) = np.inf, rows.chart(_nodes(BETWEEN), ends=False)
+    worst, tried = np.inf, dict[int, tuple[FloatArray, FloatArray]]()
     for count, degrees in CHARTS.items():
+        between = BETWEEN[count > min(CHARTS)]
+        if between not in tried:
+            tried[between] = rows.chart(_nodes(between), ends=False)
         field, entries = rows.chart(_nodes(count), ends=True)
         scale = float(entries[0].max())
         for degree in degrees:
             polynomials = _fitted(field, entries, rows.places.width, degree)
-            known = (field, entries), (between, expected)
+            known = (field, entries), tried[between]
             worst = max(float(np.abs(basis(at, degree) @ polynomials - every).max()) for at, every in known) / scale
             if worst <= TOLERANCE * (1 - SHARE) or (degree == HIGHEST and worst <= MOST):
                 return _components(rows.places, degree, polynomials, field, scale).times(float(lens_type.light))
@@ -135,21 +131,22 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
     )
 
 
+def blurred_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
+    """Return H of a blurred lens type as designed: (its measurements, N). Raises as `lens_matrix.matrix` does."""
+    if lens_type.optics.surfaces is None and camera.has_kernel(lens_type):
+        return kernels(camera, lens_type).to_sparse()
+    return matrix(camera, lens_type)
+
+
 def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[LensField, float], ...]) -> int:
     """Return by how many pixels of f light reaches beyond a footprint, distortion included."""
     places = KernelPlaces(camera, lens_type, 0)
     corner = np.array(places.extent) * places.scale
-    shrink = camera.target_pitch * camera.optical_magnification(lens_type)
-    reach = 0.0
-    for field, _ in fields:
-        spot = max(wave.spot_radius for wave in field.nodes[1])
-        wide = spot if field.rays_suffice else field.grid[1]
-        x, y = (float(each) for each in corner[::-1] * shrink)
-        edges = np.sort(_edges(camera, field, x, y, lens_type), axis=1)
-        halves = np.outer([float(side) / 2 for side in lens_type.footprint], [-1.0, 1.0])
-        moved = np.abs(edges - corner[:, None] - halves).max()
-        reach = max(reach, wide / camera.target_pitch + float(moved))
-    return ceil(reach + DEVIATIONS * camera.diffusion(lens_type)) + 1
+    x, y = (float(each) for each in corner[::-1] * camera.target_pitch * camera.optical_magnification(lens_type))
+    halves = np.outer([float(side) / 2 for side in lens_type.footprint], [-1.0, 1.0])
+    edges = (np.sort(_edges(camera, field, x, y, lens_type), axis=1) for field, _ in fields)
+    moved = max(float(np.abs(each - corner[:, None] - halves).max()) for each in edges)
+    return ceil(light_reach(camera, lens_type) + moved) + 1
 
 
 def _fitted(field: FloatArray, entries: FloatArray, wide: int, degree: int) -> FloatArray:

@@ -1,1 +1,0 @@
-"""Ray optics of lenses, without Mitsuba."""

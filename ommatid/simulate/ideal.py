@@ -17,6 +17,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, views_as_designed
+from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import Model, designed_observation, fitted_model, is_stored
@@ -129,7 +130,8 @@ def designed_kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
         raise InputError(f"camera.lens.{lens_type.name}: sub-imagers off the grid have kernels of their own")
     from ommatid.scenes.optics.lens_kernels import kernels
 
-    return kernels(camera, lens_type)
+    exact = kernels(camera, lens_type)
+    return replace(exact, shapes=KernelShapes.low_rank(exact.shapes.kernels, exact.places.width))
 
 
 def _designed_by_kernels(camera: Camera) -> FittedMatrix:

@@ -54,7 +54,7 @@ def check_lenses(camera: Camera) -> None:
     """Raise InputError for surfaces that form no image, and for distortion that folds the image."""
     for lens_type in camera.types:
         if lens_type.optics.surfaces is not None:
-            from ommatid.scenes.optics.prescription import prescription_of
+            from ommatid.scenes.optics.field import prescription_of
 
             prescription_of(camera, lens_type)
         if lens_type.optics.distortion is not None:

@@ -10,7 +10,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.lens_file import read_lens
 from ommatid.scenes.optics.dispersion import Dispersion
-from ommatid.scenes.optics.prescription import prescription_of
+from ommatid.scenes.optics.field import prescription_of
 from ommatid.scenes.scene import read, with_changes, write
 from ommatid.scenes.tables import glass
 from ommatid.scenes.tables.camera import Surface

@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.optics.prescription import Prescription, prescription_of
+from ommatid.scenes.optics.field import prescription_of
+from ommatid.scenes.optics.prescription import Prescription
 from ommatid.scenes.optics.ray_trace import (
     NUMPY,
     Disk,

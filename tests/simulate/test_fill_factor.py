@@ -63,14 +63,15 @@ def test_the_open_third_of_a_pixel_is_the_middle_one_of_nine_pixels(name: str) -
     fine = true_matrix(divided(name)).toarray().reshape(4, 6, 3, 6, 3, -1)
     openings = {("1/3", "1"): fine[:, :, 1].mean(axis=3), ("1", "1/3"): fine[..., 1, :].mean(axis=2)}
     squares = fine[:, :, 1, :, 1].reshape(144, -1)
+    within = {"surfaces": 2e-4, "diffracting": 1e-6, "out of focus": 1e-6}.get(name, 1e-9)  # edges to 6 digits
     for light, share in (("lost", 1 / 9), ("kept", 1.0)):
         found = true_matrix(opened(name, "1/3", light)[1]).toarray()
-        np.testing.assert_allclose(found, share * squares, atol=share * (2e-4 if name == "surfaces" else 1e-9))
+        np.testing.assert_allclose(found, share * squares, atol=share * within)
     # Closed forms of blur neglect how it, and the weight of light, vary within a pixel.
     whole = true_matrix(opened(name, "1")[1]).toarray() - fine.mean(axis=(2, 4)).reshape(144, -1)
     for (down, across), seen in openings.items():
         found = 3 * true_matrix(opened(name, [down, across])[1]).toarray()
-        np.testing.assert_allclose(found, seen.reshape(144, -1), atol=2 * float(np.abs(whole).max()) + 1e-9)
+        np.testing.assert_allclose(found, seen.reshape(144, -1), atol=2 * float(np.abs(whole).max()) + within)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.view import K1, MAGNIFICATION, ROTATION, misaligned, scales
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.lens_type import LensOptics
-from ommatid.scenes.optics.lens_kernels import blurred_matrix
+from ommatid.scenes.optics.lens_matrix import matrix
 from ommatid.scenes.pose import misalignments
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
@@ -145,7 +145,7 @@ def test_what_no_view_explains_is_measured_entry_by_entry() -> None:
     """A blur of one pixel of f in one lens type is no view; the other type's views still explain it."""
     cam = camera((19, 19), THREE[:2])
     lens = replace(cam.types[0], optics=LensOptics(aperture=0.4, focus=0.4 * cam.distance / 1.9))
-    blurred = blurred_matrix(replace(cam, types=(lens, *cam.types[1:])), lens)
+    blurred = matrix(replace(cam, types=(lens, *cam.types[1:])), lens)
     fit = drawn(cam, sparse.csr_array(sparse.vstack([blurred, ideal_matrix(cam)[blurred.shape[0] :]])), RAYS, 0)
     names = {sub.name for sub in cam.sub_imagers if sub.type == cam.types[0]}
     assert set(fit.record["refused"]) == names

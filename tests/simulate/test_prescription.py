@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.lens_file import read_lens
-from ommatid.scenes.optics.prescription import Prescription, prescribe, prescription_of
+from ommatid.scenes.optics.field import prescription_of
+from ommatid.scenes.optics.prescription import Prescription, prescribe
 from ommatid.scenes.scene import read, write
 from ommatid.scenes.tables import glass
 from ommatid.scenes.tables.camera import Surface

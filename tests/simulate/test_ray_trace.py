@@ -17,15 +17,14 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.lens_type import LensOptics
 from ommatid.scenes.optics import sharpness
 from ommatid.scenes.optics.etendue import relative_illumination, solid_angles
-from ommatid.scenes.optics.prescription import Prescription, prescribe, prescription_of
+from ommatid.scenes.optics.field import exit_disk_of, prescription_of, reach
+from ommatid.scenes.optics.prescription import Prescription, prescribe
 from ommatid.scenes.optics.ray_trace import (
     NUMPY,
     Disk,
     Functions,
     exit_disk,
-    exit_disk_of,
     path,
-    reach,
     spread,
     through,
     trace,

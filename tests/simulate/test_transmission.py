@@ -11,7 +11,8 @@ import pytest
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.optics.etendue import transmission, transmissions
-from ommatid.scenes.optics.prescription import Prescription, prescription_of
+from ommatid.scenes.optics.field import prescription_of
+from ommatid.scenes.optics.prescription import Prescription
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.sensors import response

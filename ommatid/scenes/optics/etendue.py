@@ -14,8 +14,8 @@ from ommatid.runtime.arrays import FloatArray
 
 from ..camera import Camera
 from ..pose import corner_offset, poses
-from .field import LensField, field_of
-from .prescription import Prescription, prescription_of
+from .field import LensField, field_of, prescription_of
+from .prescription import Prescription
 
 
 def solid_angles(camera: Camera) -> dict[str, float]:

@@ -185,5 +185,5 @@ def _components(
     coefficients[0, 0] = 1.0
     coefficients[1:, 1:] = shares
     shown = np.concatenate([polynomials[:1], vectors[:, :kept].T @ strong])
-    shapes = KernelShapes.low_rank(shown.reshape(-1, places.width, places.width), places.width)
+    shapes = KernelShapes.dense(shown.reshape(-1, places.width, places.width))
     return KernelFootprints(places, degree, shapes, coefficients, np.zeros((0, 0, len(polynomials))))

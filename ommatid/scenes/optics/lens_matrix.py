@@ -188,9 +188,9 @@ def ray_overlaps(edges: FloatArray, offsets: FloatArray, size: int, deviation: f
     deviation : of a Gaussian by which it is moved in addition, or 0
     """
     low, high, beside = edges.min(), edges.max(), DEVIATIONS * deviation
-    first: FloatArray = np.floor(low - beside + offsets)[:, None]
-    count = ceil(high - low + 2 * beside) + 1
-    cells: IntArray = first.astype(np.intp) + np.arange(count)
+    first: FloatArray = np.floor(np.round(low - beside + offsets, SAME))  # rounding decides nothing
+    count = ceil(round(float(high - low + 2 * beside), SAME)) + 1
+    cells = np.asarray(first[:, None] + np.arange(count), dtype=np.intp)
 
     def integral(t: FloatArray) -> FloatArray:
         if deviation == 0:
@@ -198,7 +198,8 @@ def ray_overlaps(edges: FloatArray, offsets: FloatArray, size: int, deviation: f
         at = t / deviation
         return t * (ndtr(at) - 0.5) + deviation / np.sqrt(2 * pi) * np.exp(-np.square(at) / 2)
 
-    shares = _shares(edges, offsets[:, None] - first - np.arange(count + 1), integral)
+    beside_first: FloatArray = (offsets - first)[:, None] - np.arange(count + 1, dtype=np.float64)
+    shares = _shares(edges, beside_first, integral)
     inside = (cells >= 0) & (cells < size)
     starts = np.concatenate([[0], np.cumsum(inside.sum(axis=1))])
     return sparse.csr_array((shares[inside], cells[inside], starts), shape=(offsets.size, size))

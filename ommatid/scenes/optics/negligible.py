@@ -22,7 +22,6 @@ from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
 from ..lens_type import LensType
 from ..scene import Scene
 from ..tables.estimation import PriorTable
-from .boxes import designed_box
 
 MOST_DISK = 1 / 20  # pixels of f, diameter of a negligible disk of defocus
 MOST_AIRY = 1 / 5  # sensor pixels, diameter of a negligible Airy disk, to its first dark ring
@@ -187,6 +186,8 @@ def _change(
 
 def _designed(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     if not camera.is_blurred(lens_type):
+        from .boxes import designed_box
+
         return designed_box(camera.shape, lens_type).to_sparse()
     from .lens_kernels import blurred_matrix
 

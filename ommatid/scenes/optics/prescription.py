@@ -19,9 +19,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
-from ..camera import Camera
 from ..constants import GREEN
-from ..lens_type import LensType
 from ..tables import glass
 from ..tables.camera import Surface
 
@@ -186,46 +184,3 @@ def prescribe(surfaces: Sequence[Surface], wavelength: float | None = None) -> P
         return lens
     heights = np.array([abs(lens.matrix(0, surface)[0, 0]) for surface in range(len(surfaces))])
     return replace(lens, stop=int(np.argmin(lens.semi_diameter / np.maximum(heights, 1e-30))))
-
-
-def prescription_of(camera: Camera, lens_type: LensType) -> Prescription:
-    """Return the surfaces of a lens type at the camera's wavelength, scaled as the scene asks.
-
-    With scale "fit", or none, the focal length is `camera.focal_length`. The front principal plane is the plane of the
-    lenses; the sensor is `camera.depth` behind the rear one, so that the magnification is the type's. Raises InputError
-    if the lens type has no surfaces or these cannot form an image there.
-    """
-    key = f"camera.lens.{lens_type.name}.surfaces"
-    if lens_type.optics.surfaces is None:
-        raise InputError(f"{key}: expected a list of surfaces or a lens file, got none")
-    try:
-        lens = prescribe(lens_type.optics.surfaces, camera.wavelength)
-        focal_length = lens.focal_length
-    except InputError as error:
-        raise InputError(f"{key}: {error}") from error
-    if focal_length < 0:
-        raise InputError(
-            f"{key}: expected a converging lens, got a focal length of {focal_length:.4g} mm; check the signs of the"
-            " radii: positive if the centre lies towards the sensor"
-        )
-    scale = lens_type.optics.scale
-    scaled = lens.scaled(scale if isinstance(scale, float | int) else camera.focal_length(lens_type) / focal_length)
-    edge = scaled.vertices[-1] + scaled.last_extent()[1]
-    room = scaled.rear_principal + camera.depth(lens_type) - edge
-    if room <= 0:
-        raise InputError(
-            f"{key}: the sensor would lie {-room:.4g} mm inside the lens, {camera.depth(lens_type):.4g} mm behind its"
-            " rear principal plane; turn the lens round, make it thinner or scale it"
-        )
-    _check_width(camera, lens_type, scaled)
-    return scaled
-
-
-def _check_width(camera: Camera, lens_type: LensType, scaled: Prescription) -> None:
-    """Raise InputError if lenses would reach into their neighbours."""
-    widest, room = 2 * float(scaled.semi_diameter.max()), camera.lens_pitch
-    if widest > room * (1 + 1e-9) and len(camera.sub_imagers) > 1:
-        raise InputError(
-            f"camera.lens.{lens_type.name}.surfaces: expected openings of at most camera.lens_pitch, {room:.4g} mm, got"
-            f" a diameter of {widest:.4g} mm after scaling; reduce semi_diameter or widen the pitch"
-        )

@@ -28,9 +28,6 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
-from ..camera import Camera
-from ..lens_type import LensType
-from ..pose import poses
 from .prescription import Prescription
 
 Direction = tuple[Any, Any, Any]
@@ -285,22 +282,6 @@ def _disk(prescription: Prescription, depths: FloatArray, field: float, rear: fl
         radius *= min(last / 64, 1.0)
         if last > 48:
             return Disk(height, radius * MARGIN)
-
-
-def reach(camera: Camera, lens_type: LensType) -> tuple[float, float, float]:
-    """Return the largest distance of a lens type's sensor points from the axis, and their least and largest depth."""
-    half = np.array(lens_type.pixels[::-1]) / 2 * camera.pixel_pitch
-    corners = (half * [[1, 1], [1, -1], [-1, 1], [-1, -1]]).T
-    pairs = zip(camera.sub_imagers, poses(camera), strict=True)
-    points = np.array([pose.middle[:, None] + pose.axes @ corners for sub, pose in pairs if sub.type == lens_type])
-    far = np.hypot(points[:, 0], points[:, 1]).max()
-    return float(far), float(-points[:, 2].max()), float(-points[:, 2].min())
-
-
-def exit_disk_of(camera: Camera, lens_type: LensType, prescription: Prescription) -> Disk:
-    """Return the exit disk for every sensor point of a lens type."""
-    field, least, largest = reach(camera, lens_type)
-    return exit_disk(prescription, sorted({least, largest}), field)
 
 
 def spread(count: int) -> tuple[FloatArray, FloatArray]:

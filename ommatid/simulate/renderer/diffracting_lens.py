@@ -22,7 +22,7 @@ from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.diffraction import QUANTILES, pattern
-from ommatid.scenes.optics.ray_trace import reach
+from ommatid.scenes.optics.field import reach
 
 from .lens import Distance, Emission, LensModel, Point, falloff, through_thin_lens
 from .loaded import dr, mi

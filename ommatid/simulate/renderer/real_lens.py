@@ -16,9 +16,17 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
-from ommatid.scenes.optics.field import SurfaceField, bands, check_waves, sampling_tables, surface_field
-from ommatid.scenes.optics.prescription import prescription_of
-from ommatid.scenes.optics.ray_trace import Functions, exit_disk_of, path, reach, trace
+from ommatid.scenes.optics.field import (
+    SurfaceField,
+    bands,
+    check_waves,
+    exit_disk_of,
+    prescription_of,
+    reach,
+    sampling_tables,
+    surface_field,
+)
+from ommatid.scenes.optics.ray_trace import Functions, path, trace
 from ommatid.scenes.optics.wavefront import GRID_REACH
 
 from .lens import Distance, Emission, LensModel, Point

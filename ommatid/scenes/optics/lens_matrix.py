@@ -188,7 +188,7 @@ def ray_overlaps(edges: FloatArray, offsets: FloatArray, size: int, deviation: f
     deviation : of a Gaussian by which it is moved in addition, or 0
     """
     low, high, beside = edges.min(), edges.max(), DEVIATIONS * deviation
-    first: FloatArray = np.floor(np.round(low - beside + offsets, SAME))  # rounding decides nothing
+    first: FloatArray = np.floor((low - beside + offsets).round(SAME))  # rounding decides nothing
     count = ceil(round(float(high - low + 2 * beside), SAME)) + 1
     cells = np.asarray(first[:, None] + np.arange(count), dtype=np.intp)
 

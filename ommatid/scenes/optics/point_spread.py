@@ -103,7 +103,8 @@ def _on_grid(wave: Wavefront, cell: float, count: int) -> FloatArray:
     # The middle of the cosines turns the phase of U alone; without it the nodes lie within the period of the grid.
     x, y = 2 * pi * cell / wavelength * (wave.cosines - wave.middle[:, None])
     transform: Any = finufft.nufft2d1  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-    field = transform(y, x, _strength(wave), (count, count), eps=PRECISION, isign=-1, nthreads=1)
+    # A grid that is finer by 1.25, not by 2, takes half the time at this precision.
+    field = transform(y, x, _strength(wave), (count, count), eps=PRECISION, isign=-1, nthreads=1, upsampfac=1.25)
     return np.asarray(np.square(np.abs(field)) * (cell / wavelength) ** 2, dtype=np.float64)
 
 

@@ -17,7 +17,7 @@ a sharp edge. Lengths are millimetres, in the coordinates of the lens: sensor po
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import ceil, pi, sqrt
 
 import numpy as np
@@ -120,6 +120,7 @@ def node_counts(half_width: float, spot: float, half: float) -> tuple[int, int]:
     return counts
 
 
+@lru_cache(maxsize=16)
 def polar_nodes(counts: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return radius, (r, 1), and angle, (1, n), of the nodes of the unit disk and their areas, (r, 1)."""
     nodes, weights = np.polynomial.legendre.leggauss(counts[0])

@@ -245,7 +245,7 @@ def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict:
 def report(
     paths: StackOrFolders, folder: FolderIfAny = None, baselines: Baselines = False, as_json: Json = False
 ) -> None:
-    """Write the page of what is there: a run, a folder of runs, or a stack; or of two runs side by side."""
+    """Write the page of a run, a folder of runs or a stack, or of two runs side by side."""
     from ommatid.pipeline.reconstruction import report_path
 
     if len(paths) > 1:

@@ -74,7 +74,6 @@ NOT_PRINTED: dict[tuple[str, str | None], str] = {
     ("docs/trust.md", "The verdict"): "constants of the text",
     ("docs/trust.md", "The held-out check"): "constants of the text",
     ("docs/coverage.md", None): "tables of `python -m tests.benchmarks pictures` and `coverage`, hours",
-    ("docs/trust.md", "Limits of the error bar"): "the table of `python -m tests.benchmarks coverage`, six hours",
     ("docs/troubleshooting.md", "Memory"): "an order of magnitude",
     ("docs/units.md", "Positions of the sub-imagers"): "stated and printed in the Python block before it",
 }

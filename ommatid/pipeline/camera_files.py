@@ -134,6 +134,7 @@ def _from_points(setup: Setup, output: Path, recording: PointRecording) -> tuple
     return model, True, calibration_warnings(outcome)
 
 
+TURNED = 1.1  # light at the sub-images of a mosaic turned by 180 degrees, over that of the mosaic
 WORST_OFFSET = 0.1  # sensor pixels between a patch and the whole pixels cut out for it; beyond, the design's H misleads
 ROW_SUM_ERROR = 0.2  # by which the median row sum of a calibrated H may differ from 1
 
@@ -146,6 +147,18 @@ def import_warnings(frames: RecordedFrames) -> list[str]:
             f"the sub-images lie up to {frames.layout.beside:.2f} sensor pixels beside whole pixels of the mosaic, so"
             " the H of the design does not hold: calibrate it from recorded points (ommatid calibrate --points)"
         )
+    if frames.layout.turned > TURNED:
+        warnings.append(
+            f"turned by 180 degrees, the mosaic has {frames.layout.turned:.2g} times as much light where the sub-images"
+            " are expected: turn all frames, or give --origin if the sensor is displaced"
+        )
+    if frames.dark is not None and frames.flat is None:
+        warnings.append(
+            "--dark without --flat: a number of the sensor is taken for a grey level of f; add flat frames of a"
+            " uniform target, of --flat-value"
+        )
+    if frames.flat is not None and frames.dark is None:
+        warnings.append("--flat without --dark: the black level of the sensor counts as light; add dark frames")
     return [*warnings, *_dead_pixels(frames)]
 
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -271,6 +272,22 @@ def test_a_sub_imager_that_saw_no_point_is_refused(imaging_camera: Camera, ommat
     np.save("points.npy", sweep(imaging_camera, truth.tocsr(), 2, np.random.default_rng(3)))
     ended = ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz")
     assert (ended.code, "got noise alone in that of II.02.02; check --origin" in ended.err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("scan", "words"),
+    [
+        (np.s_[::-1, ::-1], "from the last pixel to the first"),
+        (np.s_[:, ::-1], "from right to left"),
+        (np.s_[::-1], "from the bottom up"),
+        (np.random.default_rng(6).permutation(12), "in another order"),
+    ],
+)
+def test_points_in_another_order_are_refused(imaging_camera: Camera, ommatid: Command, scan: Any, words: str) -> None:
+    frames = sweep(imaging_camera, ideal_matrix(imaging_camera), 1, np.random.default_rng(3))
+    np.save("points.npy", frames.reshape(*imaging_camera.shape, *SHAPE)[scan].reshape(frames.shape))
+    ended = ommatid("calibrate", "scene.toml", "--points", "points.npy", "-o", "h.npz")
+    assert (ended.code, f"as if the points were scanned {words}, expected" in ended.err) == (2, True), ended.err
 
 
 def test_points_that_leave_a_pixel_dark_are_dark_frames_of_it(imaging_camera: Camera, ommatid: Command) -> None:

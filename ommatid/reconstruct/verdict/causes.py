@@ -86,7 +86,7 @@ CAUSES = (
     Cause("noise", "noise of {0:.3g} times the stated variance", "{noise}"),
     Cause("detail", "detail finer than the pixels of f", "{detail}"),
     Cause("either", "detail finer than f, or noise of {0:.3g} times the stated variance", "{detail}; or {noise}"),
-    Cause("unknown", "no known cause explains most of it; H may not be this camera's", "{calibrate}"),
+    Cause("unknown", "no known cause explains most of it; H may not be this camera's", "{unknown}"),
 )
 
 
@@ -101,10 +101,12 @@ def remedies(stack: Stack, task: EstimationTask) -> dict[str, str]:
     elif way == "ideal" and task.settings.misalignment != "fit" and _serves_fit(stack.camera):
         calibrate += f", or set {tolerance}estimator.misalignment = 'fit'"
     flat = "record the flat frames again" if stack.record.get("flat") else "import with a flat frame (--flat)"
+    unscaled = imported and stack.record.get("flat") is False
     finer = "raise target.detail" if stack.camera.has_detail else "set target.detail = 2 or more"
     noise = f"set noise.variance to that many times {float(np.mean(task.expected_noise)):.3g}"
     return {
         "calibrate": calibrate,
+        "unknown": f"{flat}, or {calibrate}" if unscaled else calibrate,
         "flat": flat if imported else "divide the readings by it",
         "dark": "import with dark frames of the same exposure (--dark)" if imported else "subtract it",
         "turn": f"turn it upright{' (--upright or --turned of ommatid import)' if imported else ''}",

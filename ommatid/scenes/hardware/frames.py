@@ -11,7 +11,7 @@ They are imported as a stack, which is reconstructed like a rendered one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -98,6 +98,7 @@ def stored_pictures(path: Path, what: str) -> list[StoredPicture]:
     return pictures
 
 
+UNLIT = 0.01  # share of the pixels of a mosaic that are taken for dark
 TIE = 1e-6  # sensor pixels, rounding error of a position half way between two pixels
 DARK, FLAT = "dark frames", "flat frames"
 LARGEST_NUMBER = float(np.finfo(np.float32).max)
@@ -131,6 +132,7 @@ class SensorLayout:
     corners : (sub-imagers, 2) top left pixels of the patches in a mosaic,
         None if every sub-imager has its own picture;  rotated : True if sub-images are upside down
     beside : largest distance, in sensor pixels along one axis, between a patch and the whole pixels cut out for it
+    turned : light at the patches of the mosaic turned by 180 degrees over that of the mosaic, 1 of several mosaics
     """
 
     camera: Camera
@@ -138,6 +140,7 @@ class SensorLayout:
     corners: IntArray | None
     rotated: bool
     beside: float
+    turned: float = 1.0
 
     def cut(self, pictures: Sequence[FloatArray]) -> FloatArray:
         """The numbers of one exposure in the order of measurements: (M,)."""
@@ -150,6 +153,18 @@ class SensorLayout:
                 pictures[0][row : row + rows, column : column + columns] for (row, column), (rows, columns) in pairs
             ]
         return np.concatenate([np.ravel(patch[::-1, ::-1] if self.rotated else patch) for patch in patches])
+
+    def light_if_turned(self, mosaic: FloatArray) -> float:
+        """Return the light at the patches of a mosaic turned by 180 degrees, over that at those of the mosaic.
+
+        It is at most 1 if there is no light beside the sub-images.
+        """
+        usable = np.abs(mosaic) <= LARGEST_NUMBER
+        if not usable.any():
+            return 1.0
+        light = np.where(usable, mosaic - np.quantile(mosaic[usable], UNLIT), 0.0)
+        turned, seen = (float(self.cut([each]).sum()) for each in (light[::-1, ::-1], light))
+        return turned / seen if seen > 0 else 1.0
 
     def exposures(self, paths: Sequence[Path], what: str, notes: FrameNotes) -> Iterator[tuple[Path, FloatArray]]:
         """Yield the last file and the numbers, (M,), of each exposure. Raises InputError for another shape.
@@ -262,11 +277,13 @@ def read_frames(
     dark_frames, flat_frames = (
         list(layout.exposures(paths, what, notes)) for paths, what in ((dark, DARK), (flat, FLAT))
     )
+    dark_mean, flat_mean = _mean(dark_frames), _mean(flat_frames)
+    _check_not_exchanged(dark_mean, flat_mean)
     return RecordedFrames(
         layout=layout,
         numbers=numbers,
-        dark=_mean(dark_frames),
-        flat=_mean(flat_frames),
+        dark=dark_mean,
+        flat=flat_mean,
         darks=len(dark_frames),
         averaged=min(len(dark_frames), len(flat_frames)),
         settings=settings,
@@ -275,6 +292,17 @@ def read_frames(
         sources=[{"name": path.name, "sha256": file_digest(path)} for path in (*files, *dark, *flat)],
         notes=notes.describe(),
     )
+
+
+def _check_not_exchanged(dark: FloatArray | None, flat: FloatArray | None) -> None:
+    if dark is None or flat is None:
+        return
+    brighter = int(np.sum(dark > flat))
+    if 2 * brighter > dark.size:
+        raise InputError(
+            f"--dark, --flat: expected flat frames brighter than dark ones, got darker ones in {brighter} of"
+            f" {dark.size} sensor pixels; exchange the two"
+        )
 
 
 def patches(camera: Camera) -> FloatArray:
@@ -314,7 +342,8 @@ def corners(
 def _layout(camera: Camera, images: Sequence[Path], settings: AcquisitionSettings, *, mosaics: bool) -> SensorLayout:
     """Find out from the first images if they are mosaics or pictures of single sub-imagers. Raises InputError."""
     first = stored_pictures(images[0], "images")
-    shape, subs = grey(first[0].pixels, str(images[0])).shape, camera.sub_imagers
+    picture, subs = grey(first[0].pixels, str(images[0])), camera.sub_imagers
+    shape = picture.shape
     count = len(first) + (0 if mosaics else sum(len(stored_pictures(path, "images")) for path in images[1:]))
     single = len(subs) == 1 and shape == subs[0].type.pixels
     if single or (count > 1 and not mosaics):
@@ -327,7 +356,8 @@ def _layout(camera: Camera, images: Sequence[Path], settings: AcquisitionSetting
             )
         return SensorLayout(camera, tuple(sub.type.pixels for sub in subs), None, settings.upright is False, 0.0)
     pixels, beside = corners(camera, shape, settings.origin, images[0])
-    return SensorLayout(camera, (shape,), pixels, not settings.upright, beside)
+    layout = SensorLayout(camera, (shape,), pixels, not settings.upright, beside)
+    return layout if mosaics else replace(layout, turned=layout.light_if_turned(picture))
 
 
 def _mean(exposures: list[tuple[Path, FloatArray]]) -> FloatArray | None:

@@ -56,6 +56,15 @@ class FootprintAssignment:
         middles = [[_middles(lens_type, axis) for axis in (0, 1)] for lens_type in types]
         return list(zip(self.camera.on_grids.type_slices(), boxes, middles, strict=True))
 
+    @property
+    def middles(self) -> FloatArray:
+        """Rows and columns of the middles of all footprints, in pixels of f: (M, 2)."""
+        found = np.empty((self.camera.measurements, 2))
+        for measurements, box, (down, across) in self._parts:
+            pixels = measurements.start + box.numbers(np.arange(down.size), np.arange(across.size))
+            found[pixels] = np.stack(np.meshgrid(down, across, indexing="ij"), axis=-1).reshape(-1, 2)
+        return found
+
     def reached(self, row: int, column: int) -> tuple[IntArray, FloatArray]:
         """Sensor pixels that a source may reach, and the distances of their footprints: (n,) each.
 
@@ -205,6 +214,14 @@ WIDTH = 3  # pixels of f that are tested for light together, and reached around 
 FAINTEST = 1e-7  # share of the value of a source, to which float32 holds it
 MEDIAN_DEVIATION = 0.6745  # median of the absolute value of a normal deviate
 CHANCE = 0.01  # probability that any noise counts as light
+BY_ROWS = "by rows from the top left"
+SCANS = {  # slopes of the light's rows and columns with those of the point, rounded; other ones are of other orders
+    BY_ROWS: [[1, 0], [0, 1]],
+    "from the last pixel to the first": [[-1, 0], [0, -1]],
+    "from right to left": [[1, 0], [0, -1]],
+    "from the bottom up": [[-1, 0], [0, 1]],
+    "by columns": [[0, 1], [1, 0]],
+}
 UNKNOWN_VARIANCE = 1.0  # of an entry without readings, which is a share from 0 to 1
 
 
@@ -282,7 +299,9 @@ def from_recorded_points(
     photons = step * (0.0 if scene.sensor is None else scene.sensor.gain)
     variance, shared = _variances(camera, entries, unlit, step if frames.whole else 0.0 * step, photons)
     starts = np.searchsorted(entries.pixel, np.arange(camera.measurements + 1))
-    _check_seen(camera, entries, variance, starts)
+    seen = _seen(entries, variance)
+    _check_seen(camera, entries, seen, starts)
+    _check_order(camera, entries, seen)
     matrix = sparse.csr_array((entries.mean, entries.unknown, starts), shape=(camera.measurements, camera.unknowns))
     made_from = {
         "camera": camera.describe(),
@@ -446,10 +465,15 @@ def _variances(
     return variance, np.where(entries.mean > step[entries.pixel] / 2, np.maximum(level, rounded), level)
 
 
-def _check_seen(camera: Camera, entries: RecordedEntries, variance: FloatArray, starts: IntArray) -> None:
+def _seen(entries: RecordedEntries, variance: FloatArray) -> BoolArray:
+    """Return True for entries that exceed their noise."""
+    recorded = entries.count > 0
+    return recorded & (entries.mean > _score(int(recorded.sum())) * np.sqrt(variance))
+
+
+def _check_seen(camera: Camera, entries: RecordedEntries, seen: BoolArray, starts: IntArray) -> None:
     """Raise InputError for a sub-imager with pixels that work, of which no entry exceeds its noise."""
     recorded = entries.count > 0
-    seen = recorded & (entries.mean > _score(int(recorded.sum())) * np.sqrt(variance))
     parts = [
         (sub.name, slice(*starts[[pixels.start, pixels.stop]]))
         for sub, pixels in zip(camera.sub_imagers, camera.slices(), strict=True)
@@ -458,7 +482,32 @@ def _check_seen(camera: Camera, entries: RecordedEntries, variance: FloatArray, 
     if blind:
         raise InputError(
             "--points: expected light of the points in every sub-image, got noise alone in that of"
-            f" {named(blind)}; check --origin, --upright and the rotation of the sensor, and record one point per image"
+            f" {named(blind)}; check --origin, --upright and the rotation of the frames, as by 180 degrees, and record"
+            " one point per image"
+        )
+
+
+def _check_order(camera: Camera, entries: RecordedEntries, seen: BoolArray) -> None:
+    """Raise InputError if the light does not move over the sensor as the points move over f.
+
+    The centre of the footprints that a point lights is a linear function of its position, to least squares weighted by
+    its light. Its slopes tell how the points were scanned.
+    """
+    unknown, light = entries.unknown[seen], entries.mean[seen]
+    middles = FootprintAssignment(camera, MARGIN).middles[entries.pixel[seen]]
+    lit, point = np.unique(unknown, return_inverse=True)
+    weight = np.sqrt(np.bincount(point, light))
+    centres = np.stack([np.bincount(point, light * middle) for middle in middles.T], axis=1) / weight[:, None]
+    places = weight[:, None] * np.stack([np.ones(lit.size), *np.divmod(lit, camera.columns)], axis=1)
+    slopes, _, rank, _ = cast(Any, np.linalg.lstsq)(places, centres, rcond=1e-9)
+    if rank < 3:
+        return  # the points lie on a line
+    found = np.rint(np.clip(slopes[1:].T, -1, 1)).tolist()
+    scan = next((scan for scan, expected in SCANS.items() if found == expected), "in another order")
+    if scan != BY_ROWS:
+        raise InputError(
+            f"--points: the light moves over the sensor as if the points were scanned {scan}, expected {BY_ROWS}; order"
+            " the images or list their positions in --places, unless the frames are mirrored, turned or --upright"
         )
 
 

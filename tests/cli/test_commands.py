@@ -233,6 +233,25 @@ def test_a_repeated_run_repeats_no_stage(kept: Path, ommatid: Command) -> None:
     assert numbers(described) == numbers(json.loads((kept / "run.json").read_text(encoding="utf-8")))
 
 
+def test_a_finished_run_is_compared_with_other_methods_and_with_another_run(
+    kept: Path, finished: Path, here: Path, ommatid: Command
+) -> None:
+    before = stamps(kept)
+    ended = ommatid("run", "tiny.toml", "-o", "out", "--baselines", "--json")
+    assert ended.code == 0, ended.err
+    [described] = document(ended)
+    assert {"single", "rearranged", "shift_and_add"} <= {each["method"] for each in described["baselines"]}
+    assert json.loads((kept / "run.json").read_text(encoding="utf-8"))["baselines"] == described["baselines"]
+    assert {name for name, at in stamps(kept).items() if at != before[name]} == {"run.json", "report.html"}
+    ended = ommatid("report", kept, finished, "-o", "both", "--json")
+    assert ended.code == 0, ended.err
+    assert document(ended) == {"pages": [str(Path("both", "comparison.html"))]}
+    assert "the same error" in (here / "both" / "comparison.html").read_text(encoding="utf-8")
+    for wrong, words in ((("-o", "both", "--baselines"), "got --baselines"), ((), "got no -o")):
+        ended = ommatid("report", kept, finished, *wrong)
+        assert (ended.code, words in ended.err) == (2, True)
+
+
 def test_another_expected_noise_redoes_the_reconstruction_alone(
     kept: Path, finished: Path, here: Path, ommatid: Command
 ) -> None:

@@ -110,7 +110,7 @@ def predict(scene: Scene | str | Path, rays: bool = True) -> Prediction:
 
 
 def render(scene: Scene | str | Path) -> Stack:
-    """Render the sub-images of a scene: (M,) values and variances, with the sensor's noise.
+    """Render the sub-images of a scene: (M,) values with the sensor's noise, and their variances.
 
     Raises InputError for a scene that cannot be rendered here.
     """

@@ -41,7 +41,7 @@ def for_stack(stack: Stack) -> StoppingRule:
     A prior that is to be fitted counts as one of natural pictures.
     """
     known = _with_known_prior(stack)
-    made_from = ["stack", digest(stack.values, stack.variance), _tables(stack.scene)]
+    made_from = ["stack", digest(stack.values, stack.rendering_variance), _tables(stack.scene)]
     return StoppingRule(
         lambda model: _added_error(known, model, None), fingerprint(made_from), "the expected error of this stack"
     )

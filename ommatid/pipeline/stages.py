@@ -19,8 +19,6 @@ from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.machine import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
-from ommatid.scenes.camera import derive
-from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
@@ -59,13 +57,13 @@ def open_scene(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = 
 
 def checked_setup(scene: Scene) -> Setup:
     """Derive the camera of a scene and load its image, if it names one. Raises InputError if either cannot be done."""
-    camera = derive(scene)  # first, since it is fast and finds most errors
+    setup = Setup.from_scene(scene)  # first, since it is fast and finds most errors
     if scene.world is not None:
         from ommatid.simulate.renderer.world import files
 
         files(scene)
     without_picture = scene.target.image is None and scene.world is None
-    return Setup(scene, camera, None if without_picture else load(scene))
+    return setup if without_picture else replace(setup, given_image=setup.picture)
 
 
 def open_member(member: Member) -> Setup:

@@ -191,7 +191,7 @@ def _measured_run(setup: Setup, samples: int, folder: Path, observer: RunObserve
     results = stages.results(_with_samples(setup, samples, samples), folder, observer)
     wall, model = clock() - start, results.model
     from_model = model.prior_variance_from_model(np.ones(model.unknowns)) if model.variance.any() else np.zeros(1)
-    light = float(np.nanmean(results.stack.variance))
+    light = float(np.nanmean(results.stack.rendering_variance))
     return MeasuredRun(results, wall, {"render": light, "calibrate": float(np.nanmean(from_model))})
 
 

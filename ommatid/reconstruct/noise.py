@@ -75,7 +75,7 @@ def usable_pixels(stack: Stack, model: Model | None = None) -> UsablePixels:
 
     With a model, pixels whose row of H is empty count as dead too.
     """
-    alive = np.isfinite(stack.values) & np.isfinite(stack.variance)
+    alive = np.isfinite(stack.values) & np.isfinite(stack.rendering_variance)
     if model is not None and model.stored is not None:
         alive &= np.diff(model.stored.indptr) > 0
     noise = stack.scene.noise
@@ -93,16 +93,9 @@ def known_noise(stack: Stack, light: FloatArray | None = None) -> Noise:
 
     light : (M,) that an estimate predicts, absent: the readings near each pixel
     """
-    noise = {"rendering": stack.variance if stack.variance.any() else uniform(0.0, stack.values.size)}
-    if stack.recording is not None:
-        light = stack.recording.smoothed_light(stack.camera) if light is None else light
-        return noise | stack.recording.noise(light)
-    table = stack.scene.noise
-    if table is not None and table.variance > 0:
-        noise["noise"] = uniform(table.variance, stack.values.size)
-    if table is not None and table.bits is not None:
-        noise["quantisation"] = uniform(table.quantisation_variance, stack.values.size)
-    return noise
+    rendering = stack.rendering_variance
+    rendering = rendering if rendering.any() else uniform(0.0, rendering.size)
+    return {"rendering": rendering} | stack.sensor_noise(light)
 
 
 def noise_at(stack: Stack, model: Model, image: FloatArray) -> Noise:

@@ -242,20 +242,23 @@ def check_region(corner: tuple[int, int], size: tuple[int, int], shape: tuple[in
 
 
 def check_camera(camera: Camera, model: Model, names: tuple[Path | str, Path | str]) -> None:
-    """Raise InputError, naming the first difference, unless a stack's camera is the model's."""
+    """Raise InputError, naming the first difference, unless the camera of a stack or scene is the model's.
+
+    names : of the stack or scene, and of the model
+    """
     rows, columns = camera.with_grid_of_matrix.shape
     if camera.has_detail and model.camera.shape != (rows, columns):
         raise InputError(
             f"{names[0]} and {names[1]} do not belong together: target.shape {list(camera.shape)} and"
-            f" target.detail {camera.detail} of the stack need H on {rows} x {columns} pixels, the model has"
-            f" {model.camera.rows} x {model.camera.columns}; calibrate with the stack's scene"
+            f" target.detail {camera.detail} of {names[0]} need H on {rows} x {columns} pixels, {names[1]} has"
+            f" {model.camera.rows} x {model.camera.columns}; calibrate the scene of {names[0]}"
         )
     recorded, calibrated = camera.with_grid_of_matrix.describe(), model.camera.describe()
     for key in [*recorded, *(key for key in calibrated if key not in recorded)]:
         if recorded.get(key) != calibrated.get(key):
             raise InputError(
-                f"{names[0]} and {names[1]} do not belong together: {key} is {recorded.get(key, 'absent')} in the"
-                f" stack and {calibrated.get(key, 'absent')} in the model; calibrate with the stack's scene"
+                f"{names[0]} and {names[1]} do not belong together: {key} is {recorded.get(key, 'absent')} in"
+                f" {names[0]} and {calibrated.get(key, 'absent')} in {names[1]}; calibrate the scene of {names[0]}"
             )
 
 

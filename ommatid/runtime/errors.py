@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 
 from .printable import printable, printable_sentence
 
@@ -69,11 +71,22 @@ def named(names: Iterable[object], quote: str = "") -> str:
 
 
 @contextmanager
-def naming_source(source: Path) -> Generator[None]:
-    """Prefix the scene file to an InputError raised inside, unless its message names the file already."""
+def naming_source(source: Path, changes: Mapping[str, str] = MappingProxyType({})) -> Generator[None]:
+    """Prefix the scene file to an InputError raised inside, unless its message names the file already.
+
+    changes : of the file's keys, in words; those whose keys the message names are named beside the file
+    """
     try:
         yield
     except InputError as error:
-        if error.args and str(source) in str(error.args[0]):
+        message = str(error).removeprefix(f"{source}: ")
+        wrong = [words for key, words in changes.items() if _names_key(message, key)]
+        if str(source) in message or (message != str(error) and not wrong):
             raise
-        raise InputError(f"{source}: {error}") from error
+        raise InputError(f"{source}{' with ' if wrong else ''}{', '.join(wrong)}: {message}") from error
+
+
+def _names_key(message: str, key: str) -> bool:
+    """Return True if a message is about a key, in which `*` is the name of any lens type, or about one inside it."""
+    pattern = re.escape(key).replace(r"\*", r"[^.\s]+")
+    return re.search(rf"(?<![\w.]){pattern}(?!\w)", message) is not None

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from pydantic import ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
-from ommatid.runtime.errors import InputError, named, shortened
+from ommatid.runtime.errors import InputError, named, naming_source, shortened
 from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import read_text, real_path
 from ommatid.runtime.printable import printable
@@ -92,6 +92,7 @@ class Scene(Table):
     design: DesignTable | None = Field(default=None, exclude=True)  # changes no run
 
     _source: Path = PrivateAttr(default=Path("scene"))
+    _changes: dict[str, str] = PrivateAttr(default_factory=dict[str, str])
     _world_copy: Path | None = PrivateAttr(default=None)
     _allow_outside: bool = PrivateAttr(default=False)
 
@@ -155,6 +156,11 @@ class Scene(Table):
     def source(self) -> Path:
         """The file that error messages name."""
         return self._source
+
+    @property
+    def changes(self) -> dict[str, str]:
+        """The options that changed keys of the file, by key, which error messages name beside it."""
+        return self._changes
 
     @property
     def world_copy(self) -> Path | None:
@@ -308,11 +314,12 @@ def with_changes(data: dict[str, Any], source: Path, overrides: Iterable[Change]
     """The scene in `data` after `--set` overrides and `--lens`, with absolute paths. Raises InputError."""
     overrides = list(overrides)
     keys = [override for override in overrides if override != ALLOW_OUTSIDE]
-    try:
+    with naming_source(source):
         data = keep_lenses(apply_overrides(data, keys), lenses)
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from error
-    scene = parse(data, source)
+    changes = toml.options_by_key(keys)
+    with naming_source(source, changes):
+        scene = parse(data, source)
+    scene._changes = changes  # pyright: ignore[reportPrivateUsage]
     scene._allow_outside = len(keys) < len(overrides)  # pyright: ignore[reportPrivateUsage]
     update: dict[str, Any] = {}
     if any(lens.surfaces is not None for lens in scene.camera.lens):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import naming_source
 
 from .camera import Camera, derive
 from .formats import picture
@@ -29,7 +30,8 @@ class Setup:
     @classmethod
     def from_scene(cls, scene: Scene) -> Setup:
         """Derive the camera of a scene. Raises InputError, which names the scene file."""
-        return cls(scene, derive(scene))
+        with naming_source(scene.source, scene.changes):
+            return cls(scene, derive(scene))
 
     @cached_property
     def picture(self) -> FloatArray:

@@ -38,8 +38,9 @@ STRAIGHT = "straight"  # key of a record: interreflection was skipped, since not
 
 @dataclass(frozen=True)
 class Stack:
-    """All sub-images of one exposure: (M,) `values` and `variance` in the order of measurements.
+    """All sub-images of one exposure: (M,) `values` and `rendering_variance` in the order of measurements.
 
+    rendering_variance : of the rendered mean, without the sensor's noise; 0 where nothing was rendered
     record : how they were made: samples, passes, seed, variant, seconds, versions, fingerprint
     recording : of a scene with a [sensor]; `values` are then the recording's, NaN for dead pixels
     """
@@ -47,7 +48,7 @@ class Stack:
     scene: Scene
     camera: Camera
     values: FloatArray
-    variance: FloatArray
+    rendering_variance: FloatArray
     record: dict[str, Any]
     recording: Recording | None = None
 
@@ -55,6 +56,25 @@ class Stack:
         """Return title and size in one line."""
         title, count = shortened(self.scene.title), len(self.camera.sub_imagers)
         return f"<Stack '{title}': {count} sub-images, {self.values.size} measurements>"
+
+    @property
+    def variance(self) -> FloatArray:
+        """Variance of the values, (M,): of the rendering, and of the sensor's noise and rounding."""
+        return np.sum([self.rendering_variance, *self.sensor_noise().values()], axis=0)
+
+    def sensor_noise(self, light: FloatArray | None = None) -> dict[str, FloatArray]:
+        """Return the variances that the [noise] or [sensor] of the scene causes, (M,) each; absent effects have none.
+
+        light : (M,) on the pixels, in units of f, absent: the readings near each pixel
+        """
+        if self.recording is not None:
+            return self.recording.noise(self.recording.smoothed_light(self.camera) if light is None else light)
+        table, noise = self.scene.noise, dict[str, FloatArray]()
+        if table is not None and table.variance > 0:
+            noise["noise"] = np.broadcast_to(np.float64(table.variance), self.values.shape)
+        if table is not None and table.bits is not None:
+            noise["quantisation"] = np.broadcast_to(np.float64(table.quantisation_variance), self.values.shape)
+        return noise
 
     def images(self) -> list[FloatArray]:
         """The sub-images, (rows, columns) each, in the order of the camera's sub-imagers."""
@@ -76,7 +96,7 @@ class Stack:
             scene=self.scene.model_copy(update=update),
             camera=camera,
             values=self.values[mask],
-            variance=self.variance[mask],
+            rendering_variance=self.rendering_variance[mask],
             recording=None if self.recording is None else self.recording.restrict(mask),
         )
 
@@ -127,7 +147,7 @@ def stack_from_recording(
 
 def write(path: Path, stack: Stack) -> None:
     """Write the sub-images as float32. Raises InputError or MachineError."""
-    channels = {"Y": stack.values, "variance": stack.variance}
+    channels = {"Y": stack.values, "variance": stack.rendering_variance}
     if stack.recording is not None:
         channels |= {"Y": stack.recording.digital, "dark": stack.recording.dark, "flat": stack.recording.flat}
     _check_range(path, "make the target or its light darker", **channels)

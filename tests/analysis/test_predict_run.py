@@ -102,7 +102,7 @@ def test_a_prediction_knows_the_variance_of_a_rendering(file: str, changes: tupl
     few = (*FEW, *changes, "render.samples=256", "calibration.method=ideal")
     setups = [Setup.from_scene(read(GALLERY / f"{file}.toml", (*few, f"render.seed={seed}"))) for seed in range(9)]
     values = [light(setup).mean for setup in setups[1:]]
-    stated = predicted_recording(setups[0]).stack.variance
+    stated = predicted_recording(setups[0]).stack.rendering_variance
     assert stated.mean() == pytest.approx(np.var(values, axis=0, ddof=1).mean(), rel=0.15)
 
 

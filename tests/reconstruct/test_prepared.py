@@ -47,7 +47,9 @@ def frames(scene: Scene, count: int, rendering: float = 0.0) -> list[Stack]:
     shape, variance = derive(scene).shape, VARIANCE if scene.noise is None else scene.noise.variance
     stacks = [recorded(scene, drawn(shape, seed), variance, seed) for seed in range(count)]
     draws = np.random.default_rng(9)
-    return [replace(stack, variance=rendering * draws.chisquare(16, stack.values.size) / 16) for stack in stacks]
+    return [
+        replace(stack, rendering_variance=rendering * draws.chisquare(16, stack.values.size) / 16) for stack in stacks
+    ]
 
 
 def assert_same(shared: Reconstruction, alone: Reconstruction) -> None:
@@ -106,7 +108,7 @@ def test_similar_noise_takes_the_error_bars_of_the_first_frame_and_its_own_estim
     assert difference is not None
     assert 0 < difference <= SAME_NOISE
     np.testing.assert_array_equal(shared.expected.variance, bars)
-    exact = np.linalg.inv(precision(ideal_matrix(model.camera), 1 / (VARIANCE + second.variance), 1 / P0))
+    exact = np.linalg.inv(precision(ideal_matrix(model.camera), 1 / (VARIANCE + second.rendering_variance), 1 / P0))
     assert np.abs(bars / np.diagonal(exact) - 1).max() <= shared.solver.variance_bound
     assert shared.solver.variance_bound == pytest.approx(
         restore(first, model).solver.variance_bound + difference, rel=1e-12
@@ -122,7 +124,7 @@ def test_other_conditions_compute_the_error_bars_again(change: str) -> None:
     prepared = Prepared(model)
     bars = restore(first, model, prepared=prepared).expected.variance
     if change == "rendering":
-        second = replace(second, variance=np.full(second.values.size, 2 * SAME_NOISE * VARIANCE))
+        second = replace(second, rendering_variance=np.full(second.values.size, 2 * SAME_NOISE * VARIANCE))
     elif change == "dead pixel":
         second = replace(second, values=np.where(np.arange(second.values.size) == 40, np.nan, second.values))
     else:

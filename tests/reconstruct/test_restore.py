@@ -146,7 +146,7 @@ def test_a_stack_and_a_model_of_different_cameras_are_refused(other: Scene, key:
     with pytest.raises(InputError, match=key):
         check_camera(stack.camera, ideal_model(other, derive(other)), ("stack.exr", "model.npz"))
     wider = replace(ideal_model(described, camera), camera=replace(camera, pixel_pitch=0.007))
-    with pytest.raises(InputError, match=r"camera\.pixel_pitch is 0\.006 in the stack and 0\.007"):
+    with pytest.raises(InputError, match=r"camera\.pixel_pitch is 0\.006 in stack\.exr and 0\.007"):
         check_camera(stack.camera, wider, ("stack.exr", "model.npz"))
 
 

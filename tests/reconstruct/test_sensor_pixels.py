@@ -227,9 +227,9 @@ def test_settings_beyond_float32_are_refused(kept: Path, ommatid: Command) -> No
 
 def test_negative_variances_are_refused(kept: Path, ommatid: Command) -> None:
     stack = stacks.read(kept / "stack.exr")
-    variance = stack.variance.copy()
+    variance = stack.rendering_variance.copy()
     variance[0] = -1.0
-    stacks.write(kept / "stack.exr", replace(stack, variance=variance))
+    stacks.write(kept / "stack.exr", replace(stack, rendering_variance=variance))
     ended = ommatid("reconstruct", kept / "stack.exr", kept / "model.npz", "-o", "below.exr")
     assert ended.code == 2
     assert "expected variances of 0 or more" in ended.err

@@ -42,11 +42,11 @@ def sensor_example(seed: int = 0) -> Stack:
     digital = rng.integers(0, 4096, cam.measurements).astype(np.float64)
     flat = flat.astype(np.float32).astype(np.float64)
     return stack_from_recording(
-        described, cam, Recording(sensor, digital, dark, flat, level), first.variance, first.record
+        described, cam, Recording(sensor, digital, dark, flat, level), first.rendering_variance, first.record
     )
 
 
-@pytest.mark.parametrize(("channel", "value"), [("values", 3e38), ("values", np.inf), ("variance", 1e40)])
+@pytest.mark.parametrize(("channel", "value"), [("values", 3e38), ("values", np.inf), ("rendering_variance", 1e40)])
 def test_readings_beyond_float32_are_not_written(tmp_path: Path, channel: str, value: float) -> None:
     first = example()
     changed = replace(first, **{channel: np.full_like(first.values, value)})
@@ -60,7 +60,7 @@ def test_write_then_read_is_the_identity(tmp_path: Path) -> None:
     stack.write(tmp_path / "stack.exr", first)
     again = stack.read(tmp_path / "stack.exr")
     np.testing.assert_array_equal(again.values, first.values)
-    np.testing.assert_array_equal(again.variance, first.variance)
+    np.testing.assert_array_equal(again.rendering_variance, first.rendering_variance)
     assert again.record == first.record
     assert again.camera == first.camera
     assert again.scene.plain() == first.scene.plain()
@@ -130,7 +130,7 @@ def test_a_recording_is_read_as_written(tmp_path: Path) -> None:
 
 def test_a_sensor_s_stack_without_frames_is_refused(tmp_path: Path) -> None:
     path, first = tmp_path / "stack.exr", sensor_example()
-    stack.write(path, Stack(first.scene, first.camera, first.values, first.variance, first.record))
+    stack.write(path, Stack(first.scene, first.camera, first.values, first.rendering_variance, first.record))
     with pytest.raises(InputError, match="should hold Y, variance, dark and flat"):
         stack.read(path)
     stack.write(path, first)

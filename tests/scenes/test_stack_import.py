@@ -34,7 +34,7 @@ def test_a_mosaic_is_cut_into_the_sub_images(
     assert ended.code == 0, ended.err
     cut = stack.read(Path("stack.exr"))
     np.testing.assert_array_equal(cut.values, values.astype(np.float32))
-    assert not cut.variance.any()
+    assert not cut.rendering_variance.any()
     described = json.loads(ended.out)
     assert described["method"] == "imported"
     assert [source["name"] for source in described["source"]] == [name]
@@ -187,6 +187,7 @@ PLACES = {
 def write_files() -> None:
     """Write the files, many of them wrong, of the commands below."""
     save(Path("m.npy"), np.zeros(SHAPE))
+    save(Path("ones.npy"), np.ones(SHAPE))
     save(Path("small.npy"), np.zeros((20, 30)))
     save(Path("dark.npy"), np.zeros((42, 61)))
     save(Path("three.npy"), np.zeros((3, *SHAPE)))
@@ -205,6 +206,7 @@ WRONG: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
     ((*IMPORT, "m.npy", "--origin", "30,30"), ("leaves the mosaic", "42 x 62")),
     ((*IMPORT, "three.npy"), ("13 pictures", "got 3")),
     ((*IMPORT, *SMALL), ("small.npy", "5 x 6", "20 x 30")),
+    ((*IMPORT, "m.npy", "--dark", "ones.npy", "--flat", "m.npy"), ("228 of 228 sensor pixels; exchange the two",)),
     ((*IMPORT, "m.npy", "--flat", "dark.npy"), ("dark.npy", "42 x 62", "42 x 61")),
     (("import", "scene.toml", "m.npy", "-o", "m.npy"), ("m.npy", "expected the name of a stack")),
     ((*CALIBRATE, "m.npy"), ("168 pixels", "got 1", "--places")),
@@ -226,6 +228,22 @@ def test_wrong_input_is_refused_in_one_sentence(ommatid: Command) -> None:
         for word in words:
             assert word in ended.err, ended.err
     assert {path: path.stat().st_mtime_ns for path in Path().iterdir()} == before
+
+
+def test_what_is_missing_or_turned_gives_a_warning(imaging_camera: Camera, ommatid: Command) -> None:
+    _, values = recorded_image(imaging_camera)
+    save(Path("m.npy"), as_mosaic(imaging_camera, np.abs(values) + 20, outside=10.0))
+    save(Path("turned.npy"), np.load("m.npy")[::-1, ::-1])
+    save(Path("dark.npy"), np.full(SHAPE, 10.0))
+    save(Path("flat.npy"), np.full(SHAPE, 265.0))
+    both = "--dark", "dark.npy", "--flat", "flat.npy"
+    commands = {("m.npy", *both): "", ("turned.npy", *both): "turned by 180 degrees, the mosaic has"}
+    commands |= {("m.npy", *both[:2]): "--dark without --flat", ("m.npy", *both[2:]): "--flat without --dark"}
+    for arguments, words in commands.items():
+        ended = ommatid("import", "scene.toml", "-o", "s.exr", *arguments)
+        warnings = [line for line in ended.err.splitlines() if line.startswith("warning")]
+        assert (ended.code, len(warnings)) == (0, 1 + bool(words)), ended.err  # one on the places of the sub-images
+        assert words in ended.err
 
 
 def test_a_restricted_import_still_has_all_types_on_the_sensor(imaging_camera: Camera, ommatid: Command) -> None:

@@ -75,7 +75,7 @@ def test_the_target_variance_is_reached_in_every_pixel(variant: str, sampler: st
     assert described.noise is not None
     assert stack.record["reached"]
     assert not stack.record["not_reached"]
-    assert (stack.variance <= SHARE * (1.0 + described.noise.quantisation_variance)).all()
+    assert (stack.rendering_variance <= SHARE * (1.0 + described.noise.quantisation_variance)).all()
 
 
 def behind_pinholes(seed: int) -> Scene:

@@ -265,7 +265,7 @@ def test_the_second_estimate_of_the_noise_is_more_accurate_and_as_good_a_weight(
         first, second = (total_variance(noise) for noise in (known_noise(stack), found.noise))
         assert _distance(second, noises[1]) < _distance(first, noises[1]) < _distance(*noises)
         ideal = stack.scene.model_copy(update={"sensor": None})
-        told = [replace(stack, scene=ideal, recording=None, variance=noise) for noise in noises]
+        told = [replace(stack, scene=ideal, recording=None, rendering_variance=noise) for noise in noises]
         errors.append([_mse(one) for one in (restore(told[0], model, truth), found, restore(told[1], model, truth))])
     by_reading, by_second, by_truth = np.mean(errors, axis=0)
     assert by_second < 0.9 * by_reading
@@ -286,7 +286,7 @@ def test_saturated_and_dead_pixels_are_left_out() -> None:
     recording = stack.recording
     assert recording is not None
     broken = replace(recording, digital=np.where(np.arange(stack.values.size) % 50 == 0, np.nan, recording.digital))
-    stack = stack_from_recording(stack.scene, stack.camera, broken, stack.variance, stack.record)
+    stack = stack_from_recording(stack.scene, stack.camera, broken, stack.rendering_variance, stack.record)
     usable = usable_pixels(stack)
     assert usable.dead == -(-stack.values.size // 50)
     assert 20 < usable.saturated < 500

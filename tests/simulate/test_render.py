@@ -60,8 +60,8 @@ def test_progress_ends_at_one_and_never_falls() -> None:
 
 def test_variances_are_stored_and_never_zero() -> None:
     stack = recorded(scene((19, 19), THREE, render={"variant": "scalar_rgb", "samples": 256}))
-    assert (stack.variance > 0).all()
-    assert stack.variance.astype(np.float32).min() > 0, "in the file's precision too"
+    assert (stack.rendering_variance > 0).all()
+    assert stack.rendering_variance.astype(np.float32).min() > 0, "in the file's precision too"
 
 
 def test_the_fingerprint_changes_with_the_inputs_of_the_values_only() -> None:

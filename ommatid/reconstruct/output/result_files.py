@@ -170,7 +170,7 @@ def fingerprint_of(stack: Stack, model: Model, truth: FloatArray | None, regions
     """Fingerprint of everything that a result depends on; truth : the target, None if it is not known."""
     entries = () if model.stored is None else (model.stored.data, model.stored.indices, model.stored.indptr)
     fitted = () if model.fitted is None else model.fitted.determining
-    arrays = (stack.values, stack.variance, *entries, model.variance, model.batches, *fitted)
+    arrays = (stack.values, stack.rendering_variance, *entries, model.variance, model.batches, *fitted)
     of_estimate = fingerprint([digest(*arrays), [stack.record, model.record], stack.scene.plain(), truth is not None])
     return fingerprint([of_estimate, regions]) if regions else of_estimate
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.input_files import check_regular
 from ommatid.runtime.machine import check_memory
 from ommatid.runtime.printable import printable
@@ -52,7 +52,7 @@ def load(scene: Scene) -> FloatArray:
             prod(target.shape) * target.detail**2 * BYTES, f"{scene.source}: target.shape", "take a smaller one"
         )
         return np.zeros(finer(target.shape, target.detail))
-    return _part_asked_for(scene, _stored(target.image, where))
+    return _read(scene, target.image)[1]
 
 
 def conversions(scene: Scene) -> list[str]:
@@ -63,8 +63,7 @@ def conversions(scene: Scene) -> list[str]:
     image = scene.target.image
     if image is None:
         return []
-    stored = _stored(image, f"{scene.source}: target.image")
-    _part_asked_for(scene, stored)
+    stored, _ = _read(scene, image)
     sentences = notes_of(image, stored)
     dtype = stored.pixels.dtype
     if dtype.kind == "u" and dtype.itemsize == 2:
@@ -151,6 +150,13 @@ def grey(pixels: NDArray[Any], where: str) -> FloatArray:
     return values[..., :3] @ np.array(LUMINANCE) if channels >= 3 else values[..., 0]
 
 
+def _read(scene: Scene, image: str) -> tuple[StoredPicture, FloatArray]:
+    """The target's picture without scaling, and its crop. Raises InputError as `load` does."""
+    with naming_source(scene.source, scene.changes):
+        stored = _stored(image, f"{scene.source}: target.image")
+        return stored, _part_asked_for(scene, stored)
+
+
 def _part_asked_for(scene: Scene, stored: StoredPicture) -> FloatArray:
     """The crop of a picture in the scene's range of values, rounded to float32. Raises InputError."""
     target, where = scene.target, f"{scene.source}: target.image"
@@ -161,7 +167,8 @@ def _part_asked_for(scene: Scene, stored: StoredPicture) -> FloatArray:
             rows, columns = finer(target.shape, target.detail)
             raise InputError(
                 f"{scene.source}: target.shape asks for {rows} x {columns} pixels, but the picture has"
-                f" {picture.shape[0]} x {picture.shape[1]}; add target.origin to cut a crop from it"
+                f" {picture.shape[0]} x {picture.shape[1]}; add target.origin to cut a crop from it, or remove"
+                " target.shape for the whole picture"
             )
         crop = picture[tuple(slice(size - size % target.detail) for size in picture.shape)]
     else:
@@ -188,7 +195,7 @@ def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
         raise InputError(
             f"{scene.source}: target.origin: the crop of {max(rows, 0)} x {max(columns, 0)} pixels at"
             f" [{row}, {column}] is empty or leaves the picture of {picture.shape[0]} x {picture.shape[1]} pixels;"
-            " correct it or target.shape"
+            " correct it or target.shape, or remove both for the whole picture"
         )
     return picture[row : row + rows, column : column + columns]
 

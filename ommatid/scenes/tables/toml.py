@@ -120,16 +120,16 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[Change]) -> dict[s
     changed = copy.deepcopy(data)
     for given in overrides:
         key, value = _assignment(given) if isinstance(given, str) else given
-        override = shortened(given if isinstance(given, str) else f"{key}={value}")
+        option = option_of(given)
         *tables, last = [part.strip() for part in key.split(".")]
         if len(tables) > DEEPEST:
-            raise InputError(f"--set {override}: its key goes deeper than {DEEPEST} tables")
+            raise InputError(f"{option}: its key goes deeper than {DEEPEST} tables")
         found: list[Any] = [changed]
         for name in tables:
-            found = [inner for table in found for inner in _inside(table, name, override)]
+            found = [inner for table in found for inner in _inside(table, name, option)]
         for table in found:
             if not isinstance(table, dict):
-                raise InputError(f"--set {override}: '{'.'.join(tables)}' is not a table, so it has no key '{last}'")
+                raise InputError(f"{option}: '{'.'.join(tables)}' is not a table, so it has no key '{last}'")
             if value is None:
                 table.pop(last, None)  # pyright: ignore[reportUnknownMemberType]
             else:
@@ -145,6 +145,20 @@ def _assignment(text: str) -> tuple[str, Any]:
     if any(0xD800 <= ord(character) < 0xE000 for character in text):
         raise InputError(f"--set {shortened(text)}: expected text in UTF-8, got other bytes")
     return key, value_of(value) if value.strip() else None
+
+
+def option_of(change: Change) -> str:
+    """Return a change in words, as an error names it: the option `--set`, or `set` for values of Python."""
+    return f"--set {shortened(change)}" if isinstance(change, str) else f"set {shortened('='.join(map(str, change)))}"
+
+
+def options_by_key(changes: Iterable[Change]) -> dict[str, str]:
+    """Return the changes in words by the dotted keys that they set or remove."""
+    options = dict[str, str]()
+    for change in changes:
+        key = change.partition("=")[0] if isinstance(change, str) else change[0]
+        options[".".join(part.strip() for part in key.split("."))] = option_of(change)
+    return options
 
 
 def changes_of(values: Mapping[str, object]) -> list[Change]:
@@ -177,7 +191,7 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"expected one of TOML's types, got {type(value)}")
 
 
-def _inside(table: Any, name: str, override: str) -> list[Any]:
+def _inside(table: Any, name: str, option: str) -> list[Any]:
     """Return the tables that a part of a key names: one, or for `*` those of all lens types."""
     if isinstance(table, list):
         lenses = _by_name(table)  # pyright: ignore[reportUnknownArgumentType]
@@ -185,10 +199,10 @@ def _inside(table: Any, name: str, override: str) -> list[Any]:
             return list(lenses.values())
         if name not in lenses:
             known = named(lenses, "'")
-            raise InputError(f"--set {override}: no lens type is called '{name}'; there are {known}")
+            raise InputError(f"{option}: no lens type is called '{name}'; there are {known}")
         return [lenses[name]]
     if not isinstance(table, dict):
-        raise InputError(f"--set {override}: '{name}' is not in a table")
+        raise InputError(f"{option}: '{name}' is not in a table")
     return [table.setdefault(name, {})]  # pyright: ignore[reportUnknownMemberType]
 
 

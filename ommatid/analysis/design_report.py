@@ -78,7 +78,7 @@ def rows(best: BestCamera, with_edges: Sequence[float | str]) -> list[tuple[str,
     if space.own is not None:
         cost = space.cost(space.own)
         others = "" if abs(cost / best.budget - 1) < PART else f", which costs {cost:.3g} {space.unit}"
-        lines.append(("this camera", f"{words_of(space.own.counts, space)}{others}: {_found(best, space.own)}"))
+        lines.append(("the scene's camera", f"{words_of(space.own.counts, space)}{others}: {_found(best, space.own)}"))
     if space.scene.camera.tolerance is not None:
         lines.append(("tolerance", "counts in the errors with edges; the bound is that of lenses in their places"))
     by_reason = groupby(sorted(space.refused.items(), key=lambda each: each[1]), key=lambda each: each[1])
@@ -102,12 +102,12 @@ def _claim(best: BestCamera) -> tuple[str, str]:
     """Return the bound in words: what no camera does, and the number."""
     goal, bound = best.space.groups.goal, best.mixture.bound
     if goal == "information":
-        return "no such camera holds more than", f"{-bound:.4g} bits per pixel"
+        return "no such camera holds more than", f"{-bound:.4g} bits of information per pixel"
     return "no such camera is better than", f"MSE {bound:.4g}{' in waves below four pixels' * (goal == 'resolution')}"
 
 
 def _value(best: BestCamera, found: Evaluation) -> str:
-    return f"{-found.value:.4g} bits per pixel" if best.space.groups.goal == "information" else f"{found.value:.4g}"
+    return f"{-found.value:.4g} bits of information per pixel" if best.space.groups.goal == "information" else f"{found.value:.4g}"
 
 
 def _found(best: BestCamera, each: WholeMixture) -> str:
@@ -116,7 +116,7 @@ def _found(best: BestCamera, each: WholeMixture) -> str:
     if goal == "information":
         return f"{_value(best, each.found)}, {above:.1%} below; error {each.found.error:.4g}"
     differs = f"{abs(above):.1%} {'above' if above >= 0 else 'below'}" if above < 1 else f"{above + 1:.3g} times that"
-    return f"{_value(best, each.found)}, {differs}; {best.space.information(each):.3g} bits per pixel"
+    return f"{_value(best, each.found)}, {differs}; {best.space.information(each):.3g} bits of information per pixel"
 
 
 def describe(best: BestCamera, with_edges: Sequence[float | str]) -> dict[str, Any]:
@@ -185,7 +185,7 @@ def draw_front(path: Path, points: Sequence[FrontPoint], best: BestCamera, files
         _draw_line(by_depth, thin, "o-", drawstyle="steps-post", label=f"{label}whole arrays", **style)
     space, own = best.space, best.space.own
     if own is not None:
-        by_cost.plot(space.cost(own), own.found.error, "k*", markersize=11, label="this camera")
+        by_cost.plot(space.cost(own), own.found.error, "k*", markersize=11, label="the scene's camera")
     by_cost.set(xscale="log", yscale="log", xlabel=f"cost, {space.unit}", ylabel="expected squared error")
     by_depth.set(yscale="log", xlabel="sensor behind its lenses, at most, mm", ylabel="expected squared error")
     for axis in (by_cost.xaxis, by_cost.yaxis, by_depth.yaxis):
@@ -216,7 +216,7 @@ def _named(best: BestCamera) -> Iterator[tuple[str, Sequence[float]]]:
     if best.whole:
         yield "best camera", best.whole[0].counts
     if best.space.own is not None:
-        yield "this camera", best.space.own.counts
+        yield "the scene's camera", best.space.own.counts
 
 
 def _draw_arrays(axes: Any, best: BestCamera) -> None:

@@ -102,7 +102,7 @@ def cause(name: str) -> str:
 def _change(name: str, part: float, report: RunReport) -> str:
     error, now = report.error, report.error.predicted_mse
     if name == "null_space":
-        return "; neither samples nor less noise reduce it (`ommatid design` chooses lens types that leave none)"
+        return "; neither samples nor less noise reduce it (`ommatid design` weighs it against noise)"
     if name in CHANGES:
         change = CHANGES[name]
         words = f"{change.words} ({change.how})" if name == "quantisation" else change.words

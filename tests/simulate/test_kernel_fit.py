@@ -112,7 +112,7 @@ def test_wide_kernels_are_the_ideal_within_their_errors(calibrations: int) -> No
     for _ in range(calibrations):
         responses = drawn(truth, rng)
         footprints = accepted(fit_kernels(responses, camera, camera.types[0]))
-        assert footprints.places.width == 115
+        assert footprints.places.width == 117
         error = (footprints.to_sparse() - truth) @ image
         deviation = np.sqrt(np.square(footprints.error_directions(image)).sum(axis=1))
         scores.append(float(np.abs(error / deviation).max()))

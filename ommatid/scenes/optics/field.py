@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from math import ceil, pi
+from typing import ClassVar
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -36,7 +37,8 @@ MOST_NODES = 17
 MOST_WIDER = 2.0  # ratio of the widths of a common grid and of the narrowest that a wave of its own would have
 LEAST_VERGENCE = 1e-9  # of a far target; that of 0 has no plane
 MOST_ABERRATED = 2.0  # spot of rays in disks of defocus, up to which it is that of defocus
-MOST_RINGS = 100.0  # spots of more than so many `resolution`s are computed by rays alone
+MOST_RINGS = 100.0  # spots of more than so many `resolution`s are computed by rays alone,
+MOST_THIN_RINGS = 400.0  # and those of thin lenses: 100 waves of defocus, whose fringes at the rim pixels resolve
 FINEST = 1 / 6  # pixels of f, shortest period that the rays of a row of H resolve
 MOST_REACH = 1000  # pixels of f
 FASTEST = 0.5  # ratio of length to width of a cone of light in air
@@ -60,6 +62,7 @@ class LensField(ABC):
     focal_length: float
     entrance_pupil: tuple[float, float]
     working_f_number: float
+    most_rings: ClassVar[float] = MOST_RINGS
 
     @abstractmethod
     def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
@@ -123,7 +126,7 @@ class LensField(ABC):
         if self.wavelength is None:
             return True
         _, waves = self._rays
-        return any(wave.spot_radius * 2 * wave.half_width > MOST_RINGS * self.wavelength for wave in waves)
+        return any(wave.spot_radius * 2 * wave.half_width > self.most_rings * self.wavelength for wave in waves)
 
     @property
     def aberrated_rays(self) -> float:
@@ -237,6 +240,7 @@ class ThinField(LensField):
 
     aperture: float
     focus: float
+    most_rings: ClassVar[float] = MOST_THIN_RINGS
 
     def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
         """Compute the wave, whose phase is quadratic; see `LensField.wave`."""

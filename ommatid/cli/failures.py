@@ -75,11 +75,12 @@ def finish_batch(outcome: BatchOutcome, as_json: bool, strict: bool = False, job
 def exit_code_of(command: Callable[[], object]) -> int:
     """Run a command line, report what stops it, and return the exit code."""
     try:
-        code = command()
-        if code == INTERRUPTED:
-            raise KeyboardInterrupt
-    except Exception as error:
-        code = report(error)
+        try:
+            code = command()
+            if code == INTERRUPTED:
+                raise KeyboardInterrupt
+        except Exception as error:
+            code = report(error)
     except KeyboardInterrupt:
         say("ommatid: stopped; finished files stay, the next run carries on from them")
         code = 1
@@ -87,7 +88,12 @@ def exit_code_of(command: Callable[[], object]) -> int:
 
 
 def report(error: Exception) -> int:
-    """Say in one sentence what went wrong, and return the exit code."""
+    """Say in one sentence what went wrong, and return the exit code. Raises KeyboardInterrupt if that was Ctrl-C."""
+    cause = error.__cause__
+    while cause is not None:  # a library that is stopped while it is imported raises ImportError from it
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause
+        cause = cause.__cause__
     if isinstance(error, OSError) and isinstance(error.filename, str):
         error = input_error(Path(error.filename), error) or error
     if isinstance(error, BatchError):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ommatid.cli.failures import exit_code_of, report
 from ommatid.pipeline.camera_files import calibrate_file
 from ommatid.pipeline.stages import export_scene
 from ommatid.reconstruct.measured_error import best_single_sub_image
@@ -402,6 +403,19 @@ def test_ctrl_c_yields_one_sentence_and_keeps_finished_files(here: Path) -> None
     assert started.returncode == 1
     assert err.strip() == "ommatid: stopped; finished files stay, the next run carries on from them"
     assert {path.name for path in (here / "out" / "tiny").iterdir()} == {"scene.toml", "truth.exr", "stack.exr"}
+
+
+def test_an_import_that_ctrl_c_stops_is_ctrl_c(capsys: pytest.CaptureFixture[str]) -> None:
+    """Libraries then raise an ImportError, which would be the failure of one scene or frame of many."""
+
+    def command() -> None:
+        try:
+            raise ImportError("initialization failed") from KeyboardInterrupt()
+        except ImportError as error:
+            report(error)
+
+    assert exit_code_of(command) == 1
+    assert capsys.readouterr().err.startswith("ommatid: stopped;")
 
 
 def test_too_large_a_reconstruction_is_refused_before_anything_is_rendered(here: Path, ommatid: Command) -> None:

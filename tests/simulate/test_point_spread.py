@@ -169,7 +169,7 @@ def test_thin_lenses_have_fringes_up_to_a_hundred_waves_of_defocus() -> None:
     field = thin_field(26.0)
     wave, cell = field.lit_wave(0.0), field.grid[0]
     spread = point_spread(wave, field.grid).values
-    v = pi / wave.resolution * cell * np.arange(1, len(spread) // 2)
+    v = pi / wave.resolution * cell * np.arange(1, len(spread) // 2, dtype=np.float64)
     one = pattern(26.0, 0.05**2)
     v = v[v < one.end]
     expected = one.spread(v) * v[0] ** 2 / (2 * pi * v)

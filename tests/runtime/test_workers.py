@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import signal
@@ -134,6 +135,18 @@ def test_threads_work_at_the_same_time() -> None:
     barrier = threading.Barrier(3)
     with worker_pool(threads=3) as pool:
         assert pool.map(lambda _: barrier.wait(timeout=30) >= 0, range(3), no_progress, 3) == [True] * 3
+
+
+def test_processes_without_shared_memory_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Semaphores are files in /dev/shm, which may be full, or read-only."""
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("multiprocessing.synchronize.SemLock.__init__", full)
+    refused = pytest.raises(MachineError, match=r"--workers: .*No space left.* make /dev/shm writable")
+    with refused, worker_pool(count=2):
+        pass
 
 
 @pytest.mark.parametrize("error", [InputError, MachineError, ZeroDivisionError])

@@ -21,7 +21,7 @@ from time import sleep
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..errors import InputError
+from ..errors import InputError, MachineError
 from .interpreter import ignore_configurations, import_path, python_environment
 from .library_warnings import library_warnings, warn_on_stderr
 from .workers import Workers, with_error_to_send
@@ -84,11 +84,17 @@ class ProcessPool(ProcessPoolExecutor):
     """Executor with `count` processes. Shutting down interrupts running tasks."""
 
     def __init__(self, count: int) -> None:
-        """Prepare the processes, which are started when they are needed."""
+        """Prepare the processes, which are started when they are needed. Raises MachineError without semaphores."""
         context = get_context("spawn")
-        with _safe_start():
-            numbers: Any = context.SimpleQueue()
-            super().__init__(count, context, _begin, (numbers, count, os.getpid()))
+        try:
+            with _safe_start():
+                numbers: Any = context.SimpleQueue()
+                super().__init__(count, context, _begin, (numbers, count, os.getpid()))
+        except OSError as error:
+            raise MachineError(
+                f"--workers: no processes could be started ({error.strerror}); make /dev/shm writable and free some of"
+                " it, or take --workers 1"
+            ) from error
         for number in range(count):
             numbers.put(number)
 

@@ -146,14 +146,14 @@ def _misaligned(scene: Scene, camera: Camera, exact: bool, allowed: int) -> Meth
     return MethodChoice(method, f"estimator.misalignment is '{method}'", memory, seconds)
 
 
-def allowed_memory(limit: int | None) -> int:
+def allowed_memory(limit: float | None) -> int:
     """Return the bytes that may be used: the limit, at most what is free.
 
     Without a limit half of what was free before this program, so that a run that began is not refused when it has
     loaded its renderer.
     """
     free = free_memory()
-    return min((free + used_memory()) // 2 if limit is None else limit, free)
+    return min((free + used_memory()) // 2 if limit is None else int(limit), free)
 
 
 def _memory(method: str, scene: Scene, camera: Camera, exact: bool) -> int:

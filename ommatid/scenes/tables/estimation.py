@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from ..geometry.quantities import SensorSize
 from .table import LARGEST, Table
-from .units import AUTO, ExpectedNoise, FillFactor, Length, Memory, Samples, Time, pair
+from .units import AUTO, FillFactor, Length, Memory, Samples, Time, pair
 
 Sampler = Literal["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
 WITHOUT_NOISE = 256  # samples where there is no noise that "auto" could compare with
@@ -158,7 +158,7 @@ def _check_misalignment(misalignment: object) -> object:
 class EstimatorTable(Table):
     """Settings of the estimate of the image."""
 
-    noise_variance: ExpectedNoise | None = Field(
+    noise_variance: Annotated[float, Field(ge=0, le=LARGEST**2)] | Literal["fit"] | None = Field(
         default=None,
         description='assumed noise variance; "fit": fitted to the stack; absent: all known noise',
     )

@@ -48,12 +48,13 @@ def explain(error: ValidationError, data: dict[str, Any], model: type[BaseModel]
     unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
     present = [problem for problem in problems if problem["type"] != "missing"]
     chosen = unknown or present or problems
-    of_key: dict[tuple[int | str, ...], ErrorDetails] = {}  # a union reports each of its branches: ours says more
+    keys = known_keys(model)
+    of_key: dict[tuple[int | str, ...], list[ErrorDetails]] = {}  # a union reports each of its branches
     for problem in chosen:
-        key = problem["loc"] if unknown else _keys_only(problem["loc"])
-        if key not in of_key or problem["type"] == "value_error":
-            of_key[key] = problem
-    sentence = _sentence(next(iter(of_key.values())), data, model)
+        of_key.setdefault(problem["loc"] if unknown else _key_of(problem["loc"], keys), []).append(problem)
+    location, branches = next(iter(of_key.items()))
+    ours = [branch for branch in branches if branch["type"] == "value_error"]
+    sentence = _sentence(location, ours or branches, data, keys)
     others = len(of_key) - 1
     return sentence + (f" (and {others} more to correct)" if others else "")
 
@@ -74,20 +75,22 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     return [model for part in get_args(annotation) for model in _models_in(part)]
 
 
-def _sentence(problem: ErrorDetails, data: dict[str, Any], model: type[BaseModel]) -> str:
+def _sentence(
+    location: tuple[int | str, ...], branches: list[ErrorDetails], data: dict[str, Any], keys: list[str]
+) -> str:
+    problem, key = branches[0], printable(_dotted(location, data), LONGEST)
     error_type = problem["type"]
-    location = problem["loc"] if error_type == "extra_forbidden" else _keys_only(problem["loc"])
-    key = printable(_dotted(location, data), LONGEST)
     if error_type == "extra_forbidden":
-        return f"unknown key '{key}'; {_nearest(location, known_keys(model))}"
+        return f"unknown key '{key}'; {_nearest(location, keys)}"
     if error_type == "missing":
         from_others = DERIVED.get(key.rsplit(".", 1)[-1], "")
         return f"the key '{key}' is missing and has no default; add it{from_others}"
     message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
     if error_type in EXPECTED:
-        message = f"expected {EXPECTED[error_type].format(**problem.get('ctx', {}))}"
+        every = [EXPECTED[each["type"]].format(**each.get("ctx", {})) for each in branches if each["type"] in EXPECTED]
+        message = f"expected {' or '.join(dict.fromkeys(every))}"
     if error_type in ("model_type", "dict_type"):
-        inside = [known.rsplit(".", 1)[-1] for known in _inside(_bare(location), known_keys(model))]
+        inside = [known.rsplit(".", 1)[-1] for known in _inside(_bare(location), keys)]
         message = f"expected a table, whose keys are {named(inside)}"
     if key == "camera.lens" and error_type != "value_error":
         message = "expected a table [[camera.lens]] for each lens type"
@@ -123,11 +126,13 @@ def _nearest(location: tuple[int | str, ...], keys: list[str]) -> str:
     return f"the keys there are {named(beside)}"
 
 
-def _keys_only(location: tuple[int | str, ...]) -> tuple[int | str, ...]:
-    # pydantic appends the branch of a union or the type of a tuple, which are not keys of the file.
-    return tuple(
-        part for part in location if isinstance(part, int) or part.isidentifier() or ("-" in part and "[" not in part)
-    )
+def _key_of(location: tuple[int | str, ...], keys: list[str]) -> tuple[int | str, ...]:
+    """Return a location without the branches of unions and the types of tuples, which pydantic appends."""
+    found: list[int | str] = []
+    for part in location:
+        if isinstance(part, int) or _bare((*found, part)) in keys:
+            found.append(part)
+    return tuple(found)
 
 
 def _dotted(location: tuple[int | str, ...], data: Any) -> str:

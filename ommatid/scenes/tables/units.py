@@ -40,11 +40,9 @@ FACTORS = {  # of the commonest units, to the last bit as pint has them; pint ta
     ("lux", "lux"): 1.0,
 }
 LONGEST_NAME, LONGEST_PATH = 255, 4000  # bytes that file systems accept
-LARGEST_VARIANCE = 1e24
 NOT_ROUNDED = Fraction(1, 40)  # magnification above which a decimal number may be a rounded 1/m
 FINEST_PART = 20  # of the side of a sensor pixel: exact areas of rotated pixels divide it
-FEWEST_SAMPLES, MOST_SAMPLES = 16, 2**24
-AUTO = "auto"  # samples: as many as needed
+AUTO: Literal["auto"] = "auto"  # samples: as many as needed
 
 
 @cache
@@ -216,28 +214,6 @@ def _plain_ratio(ratio: Fraction) -> str | int:
     return int(ratio) if ratio.denominator == 1 else str(ratio)
 
 
-def _samples(value: object) -> object:
-    if isinstance(value, int) and not isinstance(value, bool) and FEWEST_SAMPLES <= value <= MOST_SAMPLES:
-        return value
-    if value == AUTO:
-        return value
-    raise ValueError(
-        f'expected a whole number of samples from {FEWEST_SAMPLES} to {MOST_SAMPLES}, or "{AUTO}",'
-        f" got {shortened_repr(value)}"
-    )
-
-
-def _memory(value: object) -> int:
-    if isinstance(value, str):
-        try:
-            size = int(_quantity(value, "byte"))
-        except Exception as error:  # of many types, as for lengths
-            raise ValueError(f'expected an amount of memory such as "4 GB", got {shortened_repr(value)}') from error
-        if 0 < size < 2**63:
-            return size
-    raise ValueError(f'expected an amount of memory with its unit, such as "4 GB", got {shortened_repr(value)}')
-
-
 def file_name(value: str) -> str:
     """Return the name if a file can have it. Raises ValueError that says what was expected."""
     if "\0" in value or not value.strip():
@@ -246,14 +222,6 @@ def file_name(value: str) -> str:
     if len(name) > LONGEST_PATH or max(map(len, name.split(b"/"))) > LONGEST_NAME:
         raise ValueError(f"expected the name of a file, got one of {len(name)} bytes, {shortened_repr(value)}")
     return value
-
-
-def _expected_noise(value: object) -> object:
-    if value == "fit":
-        return value
-    if isinstance(value, float | int) and not isinstance(value, bool) and 0 <= value <= LARGEST_VARIANCE:
-        return float(value)
-    raise ValueError(f'expected a variance from 0 to 1e24, or "fit", got {shortened_repr(value)}')
 
 
 _RATIO = WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "number"}], "description": 'a ratio, such as "1/3"'})
@@ -296,21 +264,5 @@ Count = Annotated[int, Field(ge=1)]
 Pair = Annotated[tuple[Count, Count], BeforeValidator(counts)]
 Corner = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], BeforeValidator(_corner)]
 FileName = Annotated[str, AfterValidator(file_name)]
-Samples = Annotated[
-    int | Literal["auto"],
-    BeforeValidator(_samples),
-    WithJsonSchema(
-        {"anyOf": [{"type": "integer", "minimum": FEWEST_SAMPLES, "maximum": MOST_SAMPLES}, {"const": AUTO}]}
-    ),
-]
-Memory = Annotated[
-    int,
-    BeforeValidator(_memory),
-    PlainSerializer(lambda size: f"{size} B", return_type=str),
-    WithJsonSchema({"type": "string", "examples": ["4 GB"]}),
-]
-ExpectedNoise = Annotated[
-    float | str,
-    BeforeValidator(_expected_noise),
-    WithJsonSchema({"anyOf": [{"type": "number", "minimum": 0}, {"const": "fit"}]}),
-]
+Samples = Annotated[int, Field(ge=16, le=2**24)] | Literal["auto"]
+Memory = Annotated[float, Quantity("byte", "an amount of memory", ("4 GB", "500 MB"), 'an amount, such as "4 GB"')]

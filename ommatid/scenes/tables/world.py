@@ -28,13 +28,6 @@ UNLIKE = 1e-5  # relative, by which axes may differ in length and from right ang
 STEPS = ("rotate", "translate", "scale")
 
 
-def _white(value: object) -> object:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if value == "auto" or (number and 0 < cast(float, value) <= LARGEST):
-        return value
-    raise ValueError(f'expected a radiance above 0 and up to {LARGEST:g}, or "auto", got {shortened_repr(value)}')
-
-
 def _transform(value: object) -> tuple[float, ...]:
     """Convert 16 numbers, 4 rows or a list of steps to 16 numbers, row by row. Raises ValueError."""
     items: list[object] = list(cast(Sequence[object], value)) if isinstance(value, list | tuple) else []
@@ -123,13 +116,6 @@ Transform = Annotated[
 ]
 
 
-White = Annotated[
-    float | Literal["auto"],
-    BeforeValidator(_white),
-    WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"const": "auto"}]}),
-]
-
-
 class WorldTable(Table):
     """A Mitsuba scene behind the target or, where the target has no picture, in its place."""
 
@@ -137,7 +123,7 @@ class WorldTable(Table):
         description="a Mitsuba scene file; without the keys below in millimetres, with the camera at the origin looking"
         " along +z, +y up"
     )
-    white: White = Field(
+    white: Annotated[float, Field(gt=0, le=LARGEST)] | Literal["auto"] = Field(
         default=1.0, description='radiance of a value of 255; "auto": that of the brightest part of the view'
     )
     unit: Literal["um", "mm", "cm", "m", "km", "in", "ft"] = Field(

@@ -76,9 +76,9 @@ class Result:
         return None if made.error is None else made.error.mse
 
     @property
-    def trusted(self) -> bool | None:
-        """The verdict on the error bars, with reasons in `summary.verdict`; None for runs of earlier versions."""
-        return None if self.summary.verdict is None else self.summary.verdict.trusted
+    def trusted(self) -> bool:
+        """The verdict on the error bars, with reasons in `summary.verdict`."""
+        return self.summary.verdict.trusted
 
     def report(self, path: str | Path) -> Path:
         """Write the report as one HTML page, and return its path. Raises InputError or MachineError."""

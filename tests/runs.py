@@ -26,6 +26,7 @@ def report_of(**fields: Any) -> RunReport:
     numbers = {"condition": 1.0, "bound": 0.0, "variance_bound": 0.0, "refinements": 0}
     least: dict[str, Any] = {
         "title": "",
+        "verdict": {"trusted": True, "reasons": ()},
         "measurements": 1,
         "unknowns": 1,
         "stages": {"render": {}, "calibrate": {}, "reconstruct": {}},

@@ -30,21 +30,19 @@ def sentence(report: RunReport) -> str:
 
 def reasons(report: RunReport) -> list[str]:
     """Return what speaks against the result, one sentence for each reason or doubt."""
-    verdict = report.verdict
-    return [] if verdict is None else [_sentence(words) for words in verdict.reasons or verdict.doubts]
+    return [_sentence(words) for words in report.verdict.reasons or report.verdict.doubts]
 
 
 def grounds(report: RunReport) -> list[str]:
     """Return what the verdict of a result that can be trusted rests on, one sentence for each passed check."""
     if not is_trusted(report):
         return []
-    passed = () if report.verdict is None else report.verdict.passed
-    return [_sentence(words) for words in passed or (verdict_words.grounds(report),)]
+    return [_sentence(words) for words in report.verdict.passed or (verdict_words.grounds(report),)]
 
 
 def notes(report: RunReport) -> list[str]:
     """Return the notes of the verdict as sentences."""
-    return [] if report.verdict is None else [_sentence(words) for words in report.verdict.notes]
+    return [_sentence(words) for words in report.verdict.notes]
 
 
 def _sentence(words: str) -> str:

@@ -171,7 +171,7 @@ def _design_instead(report: RunReport, scene: Scene) -> str:
 def _with_design(report: RunReport, scene: Scene) -> RunReport:
     """Add the note to the verdict."""
     note, verdict = _design_instead(report, scene), report.verdict
-    if not note or verdict is None:
+    if not note:
         return report
     return report.with_changes(verdict=verdict.model_copy(update={"notes": (*verdict.notes, note)}))
 

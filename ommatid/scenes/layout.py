@@ -74,31 +74,15 @@ def _in_rotated_window(single: LensType, shape: tuple[int, int]) -> BoolArray:
 def check_overlap(
     types: Sequence[LensType], sub_imager: Callable[[int, int, int], SubImager], pixel_pitch: float, source: Path
 ) -> None:
-    """Raise InputError, which names the scene file, if patches overlap on the sensor.
+    """Raise InputError, which names the scene file, if patches overlap; a rotated one is the upright box around it.
 
     sub_imager : from the index of a lens type, k and l
     """
-    if any(lens_type.steered for lens_type in types):
-        indices = [
-            (index, k, l)
-            for index, each in enumerate(types)
-            for k, l in product(*map(range, each.array))  # noqa: E741
-        ]
-        _check_all_apart([sub_imager(*each) for each in indices], pixel_pitch, source)
-        return
-    # The patches of a type form a regular grid and the types lie side by side, so these neighbours suffice.
-    for index, lens_type in enumerate(types):
-        first = sub_imager(index, 0, 0)
-        if lens_type.array[0] > 1:
-            first.check_apart(sub_imager(index, 1, 0), 0, pixel_pitch, source)
-        if lens_type.array[1] > 1:
-            first.check_apart(sub_imager(index, 0, 1), 1, pixel_pitch, source)
-        if index:
-            sub_imager(index - 1, 0, types[index - 1].array[1] - 1).check_apart(first, 1, pixel_pitch, source)
-
-
-def _check_all_apart(subs: Sequence[SubImager], pixel_pitch: float, source: Path) -> None:
-    """Check every pair of patches; a rotated one counts as the upright box around it."""
+    # The patches of a type form a regular grid and the types lie side by side, so that these columns suffice.
+    steered, subs = any(lens_type.steered for lens_type in types), list[SubImager]()
+    for index, (rows, columns) in enumerate(lens_type.array for lens_type in types):
+        chosen = range(columns) if steered else sorted({0, min(1, columns - 1), columns - 1})
+        subs += [sub_imager(index, *place) for place in product(range(rows), chosen)]
     middles = np.array([sub.patch for sub in subs])
     halves = np.array([_half_extent(sub, pixel_pitch) for sub in subs])
     for index, sub in enumerate(subs[:-1]):
@@ -107,8 +91,8 @@ def _check_all_apart(subs: Sequence[SubImager], pixel_pitch: float, source: Path
         if overlapping.any():
             other = subs[index + 1 + int(overlapping.argmax())]
             raise InputError(
-                f"{source}: camera.lens.{sub.type.name}.sub_imager: the sub-images {sub.name} and {other.name} overlap"
-                " on the sensor; move one of their windows, or widen camera.lens_pitch"
+                f"{source}: camera.lens_pitch: the sub-images {sub.name} and {other.name} overlap on the sensor; widen"
+                f" the pitch{', or move one of their windows' if steered else ''}"
             )
 
 

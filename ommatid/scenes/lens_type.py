@@ -299,19 +299,6 @@ class SubImager:
         """Name of its part in a stack: type.k.l."""
         return f"{self.type.name}.{self.k:02d}.{self.l:02d}"
 
-    def check_apart(self, other: SubImager, axis: int, pixel_pitch: float, source: Path) -> None:
-        """Raise InputError, which names the scene file, if this patch overlaps that of the next sub-imager.
-
-        axis : 0 if the other one is below, 1 if it is to the right
-        """
-        distance = self.patch[1 - axis] - other.patch[1 - axis]
-        needed = (self.type.pixels[axis] + other.type.pixels[axis]) / 2 * pixel_pitch
-        if distance < needed * (1 - 1e-9):
-            raise InputError(
-                f"{source}: camera.lens_pitch: the sub-images {self.name} and {other.name} overlap on the sensor"
-                f" (their centres are {distance:.4g} mm apart, they need {needed:.4g} mm); widen the pitch"
-            )
-
 
 def check_counts(types: Iterable[LensType], source: Path) -> None:
     """Raise InputError, which names the scene file, for too many sub-imagers."""

@@ -1,8 +1,8 @@
 """The file of a model: a matrix for `scipy.sparse.load_npz`, with its variances and a description, or few numbers.
 
 `variance` is in the order of `data`; a JSON text `ommatid` holds the scene, the record of how H was determined, and a
-SHA-256. The format says which kind a file is: "csr" has entries; "boxes" has none, since the ideal H of a large frame
-follows from the scene; "views 1" has the few numbers of a fitted H, and entries of what they do not explain alone.
+SHA-256. A file has entries, the few numbers of a fitted H with entries of what they do not explain alone, or neither:
+the ideal H of a large frame follows from the scene.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import errno
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,14 @@ from .camera import Camera, derive
 from .fitted.fitted_matrix import FittedMatrix, Views
 from .fitted.kernels import KernelFootprints, read_kernels
 from .formats import npz
-from .formats.npz import Header, Headers
+from .formats.npz import Headers
 from .formats.provenance import checked
 from .model import MeasuredRows, Model, fitted_model, measured_rows
 from .scene import parse_stored
 from .setup import Setup
 from .tables.table import LARGEST
 
-CSR, BOXES, VIEWS = b"csr", b"boxes", b"views 1"
+OF_SCIPY = ("format", "_is_array")  # keys by which `load_npz` knows the kind of a matrix, which only entries have
 PREFIX, KERNELS, DESCRIPTION = "views.", "kernels.", "description"
 
 
@@ -41,14 +42,14 @@ def write(path: Path, model: Model) -> None:
     """Write a model, completely or not at all. Raises InputError or MachineError."""
     shape = np.array([model.measurements, model.unknowns], dtype=np.int64)
     arrays: dict[str, NDArray[Any]] = {"shape": shape, "variance": model.variance, "batches": model.batches}
-    stored, layout = model.stored, BOXES if model.stored is None else CSR
+    stored = model.stored
     if model.fitted is not None:
-        rest, layout = measured_rows(model), VIEWS
+        rest = measured_rows(model)
         stored = None if rest is None else rest.matrix
         none = np.zeros(0), np.zeros((0, 0), np.float32)
         arrays["variance"], arrays["batches"] = none if rest is None else (rest.variance, rest.batches)
         for name, views in model.fitted.views.items():
-            arrays |= views.arrays(f"{PREFIX}{name}")
+            arrays |= {f"{PREFIX}{name}.{each.name}": np.array(getattr(views, each.name)) for each in fields(views)}
         for name, kernels in model.fitted.kernels.items():
             arrays |= {f"{KERNELS}{name}.{key}": each for key, each in kernels.arrays.items()}
             arrays[f"{KERNELS}{name}.{DESCRIPTION}"] = np.array(json.dumps(kernels.description))
@@ -58,8 +59,9 @@ def write(path: Path, model: Model) -> None:
     record = json.dumps({"description": description, "sha256": _seal(arrays, description)})
 
     def fill(beside: Path) -> None:
-        members = {"format": np.array(layout), "_is_array": np.array(True), "ommatid": np.array(record), **arrays}
-        npz.write(beside, members)
+        whole = model.fitted is None and stored is not None
+        kind = np.array(b"csr" if whole else b"parts"), np.array(True)
+        npz.write(beside, {**dict(zip(OF_SCIPY, kind, strict=True)), "ommatid": np.array(record), **arrays})
         try:
             _arrays(beside)
         except InputError as error:
@@ -95,7 +97,11 @@ def read(path: Path) -> Model:
         raise InputError(f"{path}: its matrix is {shape}, its scene needs {expected}; calibrate again")
     if fitted is None:
         return Model(scene, camera, matrix, arrays["variance"], arrays["batches"], record)
-    if matrix is not None and _overlap(fitted, matrix):
+    described = [
+        np.repeat(fitted.views[lens.name].explained | (lens.name in fitted.kernels), lens.measurements // lens.count)
+        for lens in fitted.camera.types
+    ]
+    if matrix is not None and np.diff(matrix.indptr)[np.concatenate(described)].any():
         raise InputError(f"{path}: has rows of H that both few numbers and entries describe; calibrate again")
     rest = None if matrix is None else MeasuredRows(matrix, arrays["variance"], arrays["batches"])
     return fitted_model(scene, camera, fitted, rest, record)
@@ -114,15 +120,6 @@ def _fitted(arrays: dict[str, NDArray[Any]], camera: Camera) -> FittedMatrix | N
     if "data" not in arrays and not all(views[name].explained.all() for name in views.keys() - fitted.kernels.keys()):
         raise ValueError("it has sub-imagers that neither numbers nor entries describe")
     return fitted
-
-
-def _overlap(fitted: FittedMatrix, matrix: sparse.csr_array) -> bool:
-    """Return True if both few numbers and entries describe a row of H."""
-    described = [
-        np.repeat(fitted.views[lens.name].explained | (lens.name in fitted.kernels), lens.measurements // lens.count)
-        for lens in fitted.camera.types
-    ]
-    return bool(np.diff(matrix.indptr)[np.concatenate(described)].any())
 
 
 def _kernels(arrays: dict[str, NDArray[Any]], camera: Camera, prefix: str) -> KernelFootprints | None:
@@ -144,14 +141,7 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
         raise InputError(f"{path}: no such file")
     try:
         content = npz.read(path, check_headers)
-        layout = content["format"][()]
-        if layout not in (CSR, BOXES, VIEWS):
-            raise ValueError(f"its format is {layout!r}")
-        names = ["shape", "variance", "batches"]
-        if layout == CSR or (layout == VIEWS and "data" in content):
-            names += ENTRIES
-        names += [name for name in content if name.startswith((PREFIX, KERNELS))] if layout == VIEWS else []
-        arrays = {name: content[name] for name in names}
+        arrays = {name: each for name, each in content.items() if name not in (*OF_SCIPY, "ommatid")}
         record = parse_json(str(content["ommatid"][()]))
         description, seal = record["description"], record["sha256"]
     except InputError:
@@ -201,17 +191,9 @@ def check_headers(headers: Headers) -> None:
         raise ValueError(f"shape is of shape {headers['shape'].shape}")
     if "batches" in headers and headers["batches"].shape[0] > MOST_BATCHES:
         raise ValueError(f"it has {headers['batches'].shape[0]} batches, more than {MOST_BATCHES}")
-    _check_lengths(headers)
-
-
-def _check_lengths(headers: Mapping[str, Header]) -> None:
-    """Raise ValueError unless all arrays of entries are equally long."""
-    if "data" not in headers:
-        return
-    entries = headers["data"].shape
     for name in ("indices", "variance", "batches"):
-        if name in headers and headers[name].shape[-1:] != entries:
-            raise ValueError(f"{name} is of shape {headers[name].shape} for {entries[0]} entries")
+        if {"data", name} <= headers.keys() and headers[name].shape[-1:] != headers["data"].shape:
+            raise ValueError(f"{name} is of shape {headers[name].shape} for {headers['data'].shape[0]} entries")
 
 
 def csr_matrix(arrays: Mapping[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:

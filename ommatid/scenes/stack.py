@@ -138,13 +138,6 @@ def _checked(given: ArrayLike, lens: LensType) -> FloatArray:
     return array
 
 
-def stack_from_recording(
-    scene: Scene, camera: Camera, recording: Recording, variance: FloatArray, record: dict[str, Any]
-) -> Stack:
-    """The stack of a sensor's recording; `variance`, (M,), is that of the rendered mean."""
-    return Stack(scene, camera, recording.values, variance, record, recording)
-
-
 def write(path: Path, stack: Stack) -> None:
     """Write the sub-images as float32. Raises InputError or MachineError."""
     channels = {"Y": stack.values, "variance": stack.rendering_variance}
@@ -197,7 +190,7 @@ def read(path: Path) -> Stack:
     digital, dark, flat = (_joined(parts, name) for name in ("Y", *SENSOR_CHANNELS))
     _check_range(path, AGAIN, variance=variance, Y=digital, dark=dark, flat=flat)
     recording = Recording(scene.sensor, digital, dark, flat, _flat_values(path, parts, sizes))
-    return stack_from_recording(scene, camera, recording, variance, record)
+    return Stack(scene, camera, recording.values, variance, record, recording)
 
 
 def read_header(path: Path) -> tuple[Scene, Camera]:

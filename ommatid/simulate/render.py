@@ -26,7 +26,7 @@ from ommatid.scenes.recording import Recording
 from ommatid.scenes.scene import TRUTH
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import posterior_variances_among
-from ommatid.scenes.stack import STRAIGHT, Stack, stack_from_recording
+from ommatid.scenes.stack import STRAIGHT, Stack
 from ommatid.scenes.tables.sensor import SensorTable
 
 from .renderer.variant import choose, release
@@ -153,7 +153,7 @@ def exposed(setup: Setup, light: FloatArray, variance: FloatArray, record: dict[
     scene, camera, values = setup.scene, setup.camera, light
     if scene.sensor is not None:
         recording = _recording(setup, scene.sensor, light)
-        return stack_from_recording(setup.resolved, camera, recording, variance, record)
+        return Stack(setup.resolved, camera, recording.values, variance, record, recording)
     if scene.noise is not None:
         from .sensors import expose, generators
 

@@ -86,7 +86,7 @@ def is_inside(report: RunReport) -> bool | None:
 
 def is_red(report: RunReport) -> bool:
     """Return whether the verdict is not to be trusted."""
-    return report.verdict is not None and not report.verdict.trusted
+    return not report.verdict.trusted
 
 
 def allowed_misses(runs: int) -> int:

@@ -167,7 +167,7 @@ def measured(run: Run, folder: Path) -> dict[str, Any]:
         "stated": error.predicted_mse,
         "mse": error.mse,
         "interval": None if interval is None else [interval.low, interval.high],
-        "level": None if report.verdict is None else report.verdict.level,
+        "level": report.verdict.level,
         "scores": scores,
     }
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from ommatid.reconstruct.output import run_json
+from ommatid.runtime.errors import InputError
 
 from ..conftest import Command
 from ..runs import document
@@ -18,7 +19,7 @@ def test_strict_exits_with_3_where_results_are_not_to_be_trusted(kept: Path, omm
     assert (plain.code, strict.code) == (0, 3)
     assert plain.out == strict.out, "the results are written and printed all the same"
     assert plain.out.startswith("tiny: not to be trusted: ")
-    assert run_json.read(kept).verdict is not None
+    assert not run_json.read(kept).verdict.trusted
     files = kept / "stack.exr", kept / "model.npz", "-o", "again.exr"
     assert ommatid("reconstruct", *files).code == 0
     assert ommatid("reconstruct", *files, "--strict").code == 3
@@ -44,7 +45,8 @@ def test_results_of_an_earlier_version_get_a_verdict(kept: Path, ommatid: Comman
     before = json.loads(path.read_text(encoding="utf-8"))
     verdict = before.pop("verdict")
     path.write_text(json.dumps(before), encoding="utf-8")
-    assert run_json.read(kept).verdict is None
+    with pytest.raises(InputError, match="verdict is wrong"):
+        run_json.read(kept)
     ended = ommatid("run", "tiny.toml", "-o", "out", "--strict")
     assert ended.code == 3
     assert json.loads(path.read_text(encoding="utf-8"))["verdict"] == verdict

@@ -188,7 +188,8 @@ def number(index: int, value: float) -> Callable[[dict[str, Any]], object]:
 )
 def test_views_that_no_camera_has_are_refused(change: Callable[[dict[str, Any]], object]) -> None:
     errors = np.full((3, COUNT, 1), 1e-3)
-    arrays = Views(np.zeros((3, COUNT)), np.ones(3, bool), errors, errors, ("own",) * COUNT).arrays("v")
+    arrays: dict[str, Any] = {"v.numbers": np.zeros((3, COUNT)), "v.explained": np.ones(3, bool)}
+    arrays |= {"v.own": errors, "v.shared": errors, "v.structure": np.array(("own",) * COUNT)}
     assert Views.from_arrays(arrays, "v").structure == ("own",) * COUNT
     change(arrays)
     with pytest.raises(ValueError, match="views v "):

@@ -28,7 +28,7 @@ from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.optics.wavefront import thin_wavefront
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.stack import stack_from_recording
+from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import light
 from ommatid.simulate.sampling.passes import Plan
@@ -255,9 +255,9 @@ def test_without_shot_noise_no_photon_is_drawn_and_one_estimate_suffices(monkeyp
     record(light, response, described.sensor, camera, 0)
     assert draws[0] > 0
     model = ideal_model(described, camera)
-    assert not depends_on_light(stack_from_recording(described, camera, short, np.zeros(light.size), {}), model)
+    assert not depends_on_light(Stack(described, camera, short.values, np.zeros(light.size), {}, short), model)
     bright, same = dim(sensor={**described.sensor.model_dump(mode="json"), "illuminance": "5000 lux"})
-    assert depends_on_light(stack_from_recording(bright, same, short, np.zeros(light.size), {}), model)
+    assert depends_on_light(Stack(bright, same, short.values, np.zeros(light.size), {}, short), model)
 
 
 @pytest.mark.parametrize("side", [0.1, 1.0, 3.0, 10.0])

@@ -13,7 +13,7 @@ from ommatid.scenes import stack
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats import exr
 from ommatid.scenes.recording import Recording
-from ommatid.scenes.stack import Stack, stack_from_recording
+from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.sensor import SensorTable
 
 from ..examples import THREE, camera, scene
@@ -41,9 +41,8 @@ def sensor_example(seed: int = 0) -> Stack:
     level = np.repeat([1000 / 7, 1000 / 3, np.pi], [lens_type.measurements for lens_type in cam.types])
     digital = rng.integers(0, 4096, cam.measurements).astype(np.float64)
     flat = flat.astype(np.float32).astype(np.float64)
-    return stack_from_recording(
-        described, cam, Recording(sensor, digital, dark, flat, level), first.rendering_variance, first.record
-    )
+    recording = Recording(sensor, digital, dark, flat, level)
+    return Stack(described, cam, recording.values, first.rendering_variance, first.record, recording)
 
 
 @pytest.mark.parametrize(("channel", "value"), [("values", 3e38), ("values", np.inf), ("rendering_variance", 1e40)])

@@ -22,7 +22,7 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.recording import Recording, expected_recording
 from ommatid.scenes.scene import Scene
-from ommatid.scenes.stack import Stack, stack_from_recording
+from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.scenes.tables.sensor import SensorTable
 from ommatid.simulate import sensors
@@ -243,7 +243,7 @@ def taken(lux: float, seed: int = 0, lenses: Lenses = THREE, response: float = 1
     everywhere = np.full(camera.measurements, response * lux / 100)
     found = record(model.forward(truth), everywhere, described.sensor or sensor(), camera, seed)
     told: dict[str, Any] = {"seconds": 0.0, "versions": {}, "seed": seed, "first_seed": seed}
-    return stack_from_recording(described, camera, found, np.zeros(camera.measurements), told), model
+    return Stack(described, camera, found.values, np.zeros(camera.measurements), told, found), model
 
 
 def inside(found: Reconstruction) -> bool:
@@ -286,7 +286,7 @@ def test_saturated_and_dead_pixels_are_left_out() -> None:
     recording = stack.recording
     assert recording is not None
     broken = replace(recording, digital=np.where(np.arange(stack.values.size) % 50 == 0, np.nan, recording.digital))
-    stack = stack_from_recording(stack.scene, stack.camera, broken, stack.rendering_variance, stack.record)
+    stack = Stack(stack.scene, stack.camera, broken.values, stack.rendering_variance, stack.record, broken)
     usable = usable_pixels(stack)
     assert usable.dead == -(-stack.values.size // 50)
     assert 20 < usable.saturated < 500

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import special
 
 from ommatid.runtime.arrays import BoolArray, FloatArray
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, named
 from ommatid.runtime.machine import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.lens_type import SubImager
@@ -41,7 +41,6 @@ MOST_QUICK_DETAILED = 1500  # where the world is finer than f, so that S is that
 MOST_NAMED = 10  # sub-imagers left out one after the other
 LEAST_DEVIATE = -37.0  # z of a probability of 1 in float64
 TERMS = 200  # of a continued fraction
-MOST_LISTED = 5  # sub-imagers in one sentence
 
 
 def log_survival(chi_squared: FloatArray, freedoms: FloatArray) -> FloatArray:
@@ -291,8 +290,4 @@ def _size(entry: HeldOutEntry) -> str:
 
 
 def _listed(entries: list[HeldOutEntry]) -> str:
-    """Return "A", "A and B", or the first few names and the number of the others."""
-    names = [entry.name for entry in entries[:MOST_LISTED]]
-    more = len(entries) - len(names)
-    names += [f"{more} more"] if more else []
-    return f"{', '.join(names[:-1])} and {names[-1]}" if names[1:] else names[0]
+    return named(entry.name for entry in entries)

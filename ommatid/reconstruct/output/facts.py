@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import exp, sqrt
 from pathlib import Path
 from typing import Literal, NamedTuple
+
+from ommatid.runtime.errors import named
 
 from .run_json import (
     DiagnosticsReport,
@@ -20,7 +21,6 @@ from .run_json import (
 from .verdict_words import cause, error_words, grounds, heading, is_trusted, limit
 
 UNDETERMINED = 5.0  # deviation of the logarithm of a fitted number that may be anything
-MAX_NAMES = 5  # sub-imagers named in one fact
 ALIKE = 0.01  # relative difference of two errors, below which neither is called smaller
 METHODS = {
     "single": "best single sub-image",
@@ -182,7 +182,7 @@ def samples_of(stage: StageReport) -> str:
     words = f"{stage.fewest_samples} to {stage.samples} samples per pixel, as many as were needed"
     missed = list(stage.not_reached)
     if missed:
-        return f"{words}; too few for {_named(missed)}: {stage.not_reached[missed[0]]}"
+        return f"{words}; too few for {named(missed)}: {stage.not_reached[missed[0]]}"
     return words if stage.auto.get("reached", True) else f"{words}; too few, no more are taken"
 
 
@@ -199,16 +199,11 @@ def region(report: RegionReport) -> Fact:
 
 
 def _verdict(report: RunReport) -> list[Fact]:
-    notes = () if report.verdict is None else report.verdict.notes
     return [
         Fact("verdict", f"{heading(report)}: {grounds(report)}", topic="verdict"),
-        *(Fact("  note", note) for note in notes),
+        *(Fact("  note", note) for note in report.verdict.notes),
         *(Fact("assumed", assumption) for assumption in report.assumes),
     ]
-
-
-def _named(names: Sequence[str]) -> str:
-    return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if names[MAX_NAMES:] else "")
 
 
 def _stages(report: RunReport) -> list[Fact]:
@@ -326,7 +321,7 @@ def _model(model: ModelReport) -> list[Fact]:
         found.append(Fact("H against the ideal one", difference))
     if model.fit is not None:
         refused = model.fit["refused"]
-        rest = f"; as measured, since the fit is not good there: {_named(refused)}" if refused else ""
+        rest = f"; as measured, since the fit is not good there: {named(refused)}" if refused else ""
         found.append(Fact("H by a fit of its geometry", f"{model.fit['accepted']} sub-imagers{rest}"))
     return found
 

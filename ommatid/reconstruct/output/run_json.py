@@ -12,7 +12,7 @@ from math import log10
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, computed_field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, computed_field, field_validator, model_validator
 
 from ommatid.runtime.errors import InputError, named, shortened
 from ommatid.runtime.files import write_text
@@ -266,8 +266,7 @@ class ModelReport(Record):
     rms_difference_from_ideal: float | None
     max_z: float | None
     p_value: float | None
-    # Files of earlier versions call it feigned_information.
-    spurious_information: float = Field(validation_alias=AliasChoices("spurious_information", "feigned_information"))
+    spurious_information: float
     fit: FitRecord | None = None
 
 
@@ -482,7 +481,7 @@ class RunReport(Record):
     command: tuple[str, ...] = ()
     date: str | None = None
     host: str | None = None
-    verdict: VerdictReport | None = None  # absent in files of earlier versions
+    verdict: VerdictReport
     measurements: int
     unknowns: int
     stages: dict[str, StageReport]

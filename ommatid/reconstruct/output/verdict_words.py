@@ -35,7 +35,7 @@ SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples
 
 def is_trusted(report: RunReport) -> bool:
     """Return True unless the verdict says that the error bars are not to be trusted."""
-    return report.verdict is None or report.verdict.trusted
+    return report.verdict.trusted
 
 
 def follows_samples(report: RunReport) -> bool:
@@ -49,8 +49,6 @@ def follows_samples(report: RunReport) -> bool:
 
 def heading(report: RunReport) -> str:
     """Return the verdict in two or three words."""
-    if report.verdict is None:
-        return "no verdict"
     if report.verdict.level != "green":
         return "not to be trusted" if report.verdict.level == "red" else "trusted with a doubt"
     return "trusted" if report.verdict.passed else "not checked"
@@ -59,8 +57,6 @@ def heading(report: RunReport) -> str:
 def grounds(report: RunReport) -> str:
     """Return what the verdict rests on: the reasons against trust, or the checks that found nothing wrong."""
     verdict = report.verdict
-    if verdict is None:
-        return "the results are of an earlier version; run the scene again"
     return "; ".join(
         verdict.reasons
         or (*verdict.doubts, *verdict.passed)

@@ -52,16 +52,6 @@ class Views:
         """True if no number differs from the design, and every sub-imager is explained."""
         return bool(self.explained.all()) and all(each == "designed" for each in self.structure)
 
-    def arrays(self, name: str) -> dict[str, Any]:
-        """Return the arrays of a file, under keys that begin with `name`."""
-        return {
-            f"{name}.numbers": self.numbers,
-            f"{name}.explained": self.explained,
-            f"{name}.own": self.own,
-            f"{name}.shared": self.shared,
-            f"{name}.structure": np.array(self.structure),
-        }
-
     @classmethod
     def from_arrays(cls, arrays: dict[str, Any], name: str) -> Views:
         """Read the arrays of a file. Raises KeyError or ValueError for others."""

@@ -156,10 +156,18 @@ def _parts(path: Path, header_only: bool = False) -> list[Any]:
     """Parts of a file as the library reads them. Raises InputError if it cannot."""
     import OpenEXR
 
+    with _readable(path), _silenced():
+        return list(OpenEXR.File(str(path), separate_channels=True, header_only=header_only).parts)
+
+
+@contextmanager
+def _readable(path: Path) -> Generator[None]:
+    """Convert what the library raises for a damaged file to InputError."""
     try:
-        with _silenced():
-            return list(OpenEXR.File(str(path), separate_channels=True, header_only=header_only).parts)
-    except (RuntimeError, ValueError, TypeError, KeyError, IndexError, UnicodeDecodeError) as error:
+        yield
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, TypeError, KeyError, IndexError) as error:
         raise InputError(
             f"{path}: expected an OpenEXR file, got one that cannot be read ({printable(error, longest=100)})"
         ) from error
@@ -173,7 +181,7 @@ def _open(path: Path, header_only: bool = False) -> list[tuple[str, dict[str, ND
         raise InputError(f"{path}: no such file") from error
     if not header_only:
         check_memory(_declared_size(path), f"{path}: to read it", "take a smaller one, or free some memory")
-    try:
+    with _readable(path):
         return [
             (
                 str(part.header.get("name", "")),
@@ -184,12 +192,6 @@ def _open(path: Path, header_only: bool = False) -> list[tuple[str, dict[str, ND
             )
             for part in _parts(path, header_only)
         ]
-    except InputError:
-        raise
-    except (RuntimeError, ValueError, TypeError, KeyError) as error:
-        raise InputError(
-            f"{path}: expected an OpenEXR file, got one that cannot be read ({printable(error, longest=100)})"
-        ) from error
 
 
 def _declared_size(path: Path) -> int:

@@ -31,7 +31,7 @@ from ..formats.picture_file import read_frames_of
 from ..formats.stored_picture import StoredPicture
 from ..recording import Recording
 from ..setup import Setup
-from ..stack import Stack, stack_from_recording
+from ..stack import Stack
 from ..tables.sensor import SensorTable
 
 SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy")
@@ -388,7 +388,7 @@ def import_stack(setup: Setup, images: Sequence[Path], settings: AcquisitionSett
         return Stack(stored, camera, _as_float32(frames.values()[0]), zeros, record), frames
     recording = _recording(stored.source, stored.sensor, frames)
     stored = stored.model_copy(update={"sensor": recording.sensor})
-    return stack_from_recording(stored, camera, recording, zeros, record), frames
+    return Stack(stored, camera, recording.values, zeros, record, recording), frames
 
 
 def _recording(source: Path, sensor: SensorTable, frames: RecordedFrames) -> Recording:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from ommatid.reconstruct.prior import reflecting_root
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive
 from ommatid.scenes.fitted.kernels import KernelFootprints
-from ommatid.scenes.fitted.view import COUNT, real_box
 from ommatid.scenes.observation import Entries, Observation
 from ommatid.scenes.scene import Scene
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
@@ -131,43 +129,6 @@ def test_one_sweep_serves_any_h_and_any_noise() -> None:
     found = swept_maps(model.matrix, weights, np.ones(weights.size), 1 / P0, shape, model.windowed.reach)
     dense = precision(model.matrix, weights, 1 / P0)
     np.testing.assert_allclose(found[0].ravel(), np.diagonal(linalg.inv(dense)), rtol=1e-8)
-
-
-@mock.patch.multiple("ommatid.reconstruct.frame.windows", LONG_HALO=0, MEDIUM_HALO=0)  # nothing else corrects them
-@pytest.mark.parametrize(
-    "case", [pytest.param("even", marks=pytest.mark.slow), "uneven", "moved", "unused", "as designed"]
-)
-def test_windows_follow_from_one_with_the_same_footprints(case: str) -> None:
-    """Against every window's own solution, with noise that differs and a dead pixel, behind displaced pinholes.
-
-    As designed, footprints are the same at any place, though other sub-imagers see them.
-    """
-    types = ("1/3", [3, 3], "fit"), ("1/5", [5, 5], "fit") if case == "as designed" else ("1/4", [4, 4], "fit")
-    task, rng = task_of(wide((87, 99), types, **CORRELATED), 0.5), np.random.default_rng(0)
-    camera, observation = task.model.camera, task.model.applied
-    middles = np.array(camera.middles)
-    if case != "as designed":
-        numbers = [np.append(rng.uniform(-0.2, 0.2, 2), np.zeros(COUNT - 2)) for _ in camera.sub_imagers]
-        boxes = [real_box(camera.shape, sub, each) for sub, each in zip(camera.sub_imagers, numbers, strict=True)]
-        observation = Observation(camera.shape, tuple(boxes))
-    if case in ("uneven", "as designed"):
-        more = rng.uniform(1, 1.2, middles.shape[1]) * np.where(np.abs(middles[0] - 60) < 3, 8.0, 1.0)
-        task = replace(task, expected_noise=0.5 * more)
-    if case == "moved":  # by nearly as much as windows may follow
-        task = replace(task, expected_noise=np.where(np.abs(middles[0] - 60) < 3, 0.6, 0.5))
-    if case == "unused":
-        used = np.arange(middles.shape[1]) != int(np.argmin(np.square(middles - 42.2).sum(axis=0)))
-        task = replace(task, used=used, expected_noise=task.expected_noise[used])
-    windows = Windows(task, np.minimum(task.expected_noise, 0.55), (12, 12), 8)
-    with mock.patch.object(Windows, "map", autospec=True, side_effect=Windows.map) as mapped:
-        found = windows.frame(observation)
-    assert mapped.call_count < (40 if case == "moved" else 8 * 9)
-    with mock.patch("ommatid.reconstruct.frame.windows.REPEATS", 1000):
-        expected = windows.frame(observation)
-    accuracy = {"even": 1e-5, "unused": 1e-5, "moved": 1e-2}.get(case, 3e-3)
-    for one, other in ((found.posterior, expected.posterior), (found.variance, expected.variance)):
-        np.testing.assert_allclose(one, other, rtol=accuracy)
-    np.testing.assert_allclose(found.missing, expected.missing, rtol=10 * accuracy)
 
 
 UNEVEN = np.array([[1.0, 0.04, -0.02, -0.1, 0.02, -0.07]])  # a Legendre polynomial over the field

@@ -111,25 +111,6 @@ def prior_precision(prior: FloatArray, shape: tuple[int, int]) -> FloatArray:
     return np.ascontiguousarray(products.transpose(0, 2, 1, 3)).reshape(count, count)
 
 
-def columns_of_covariance(
-    precision: FloatArray, prior: FloatArray, pixels: NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the columns of C = K^-1 of these pixels, (N, n), and the diagonal of C P0^-1 C at them, (n,).
-
-    precision : (N, N) K of a small frame;  prior : (rows, columns) 1 / the spectrum of P0;  pixels : (n,) in ascending
-        order
-    """
-    factor, _ = factorise_positive(precision)
-    if pixels.size == precision.shape[0]:
-        columns = factor.inverse()
-    else:
-        units = np.zeros((precision.shape[0], pixels.size))
-        units[pixels, np.arange(pixels.size)] = 1.0
-        columns = factor.solve(units)
-    waves = np.asarray(fft.dctn(columns.reshape(*prior.shape, -1), 2, axes=(0, 1), norm="ortho"))
-    return columns, np.einsum("rc,rcn->n", prior, np.square(waves))
-
-
 def dense_maps(
     matrix: sparse.csr_array,
     noise: tuple[FloatArray, FloatArray],
@@ -139,10 +120,18 @@ def dense_maps(
 ) -> FloatArray:
     """Return the three maps of pixels of a small frame: (3, n).
 
-    matrix : (M, N) H;  noise : (M,) 1 / Rv, and Rvm / Rv
-    precision, prior, pixels : as of `columns_of_covariance`
+    matrix : (M, N) H;  noise : (M,) 1 / Rv, and Rvm / Rv;  precision : (N, N) K
+    prior : (rows, columns) 1 / the spectrum of P0;  pixels : (n,) in ascending order
     """
-    covariance, missing = columns_of_covariance(precision, prior, pixels)
+    factor, _ = factorise_positive(precision)
+    if pixels.size == precision.shape[0]:
+        covariance = factor.inverse()
+    else:
+        units = np.zeros((precision.shape[0], pixels.size))
+        units[pixels, np.arange(pixels.size)] = 1.0
+        covariance = factor.solve(units)
+    waves = np.asarray(fft.dctn(covariance.reshape(*prior.shape, -1), 2, axes=(0, 1), norm="ortho"))
+    missing = np.einsum("rc,rcn->n", prior, np.square(waves))
     posterior = covariance[pixels, np.arange(pixels.size)]
     noisy, (weights, ratios) = posterior - missing, noise
     if not np.allclose(ratios, 1.0, rtol=1e-9):

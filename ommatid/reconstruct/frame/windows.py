@@ -7,8 +7,6 @@ long halo correct all.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Hashable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,8 +15,7 @@ from math import ceil
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import fft, sparse
+from scipy import sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.machine import one_thread, processors
@@ -26,13 +23,12 @@ from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.observation import Entries, Observation, ObservationPart
 
 from ..methods.method import EstimationTask
-from ..problem import dense_or_sparse, gram
+from ..problem import gram
 from .bands import Bands
 from .swept import swept_maps
 from .variance_map import (
     Interior,
     VarianceMap,
-    columns_of_covariance,
     dense_maps,
     is_narrow,
     mean_ratios,
@@ -52,9 +48,6 @@ RIM = 0.3  # of such a window that lies beside its core, on either side
 FEWEST, MOST = 3, 8  # such windows along an axis
 Core = tuple[slice, ...]
 WHOLE = slice(None), slice(None)
-REPEATS = 5  # windows with the same footprints, from which one and how the others differ are faster than all
-PLACES = 6  # digits of places of readings, in pixels of f, beyond which they are rounded otherwise everywhere
-MOVED = 0.1  # change of a variance by other noise up to which it is known to a hundredth
 VARYING = 0.05  # variation of kernels from which windows count it; one of 0.09 makes a map 11 % wrong
 
 
@@ -63,49 +56,6 @@ class Stretch(NamedTuple):
 
     first: int
     core: slice
-
-
-@dataclass(frozen=True)
-class Response:
-    """The maps of the core of a window, and what they are for noise of its readings that is not far from that at hand.
-
-    The noise of a reading changes C by a matrix of rank one. The maps are those of the sum of these matrices, in which
-    products of two of them are left out. With D = C P0^-1 C:
-
-    posterior, missing : (rows, columns) diagonals of C and D;  noise : (readings,) Rv
-    beside : (readings,) its part by what they see beside the window
-    squares, products : (readings, pixels) of (H C)^2 and of H C times H D
-    leverage, prior_leverage : (readings,) diagonals of H C H^T and H D H^T
-    """
-
-    posterior: FloatArray
-    missing: FloatArray
-    noise: FloatArray
-    beside: FloatArray
-    squares: NDArray[np.float32]
-    products: NDArray[np.float32]
-    leverage: FloatArray
-    prior_leverage: FloatArray
-
-    def maps(self, expected: FloatArray, actual: FloatArray) -> FloatArray | None:
-        """Return the three maps, (3, rows, columns), or None if the noise is too far from that at hand.
-
-        expected, actual : (readings,) noise without the part from beside the window, infinite and 0 where unused
-        """
-        weights = 1 / (expected + self.beside)
-        change = weights - 1 / self.noise
-        shrunk = 1 / (1 + change * self.leverage)
-        change *= shrunk
-        excess = np.zeros_like(weights)
-        np.multiply(actual - expected, np.square(weights * shrunk), out=excess, where=weights > 0)
-        by_squares = np.array([-change, np.square(change) * self.prior_leverage, excess], dtype=np.float32)
-        more, own, noisier = (by_squares @ self.squares).reshape(3, *self.posterior.shape)
-        if (np.abs(more) > MOVED * self.posterior).any():
-            return None
-        posterior = self.posterior + more
-        less = 2 * (change.astype(np.float32) @ self.products).reshape(self.posterior.shape)
-        missing = self.missing + own - less
-        return np.array([posterior, missing, posterior - missing + noisier])
 
 
 @dataclass(frozen=True)
@@ -149,33 +99,14 @@ class Windows:
         return dense_maps(matrix, noise, precision, 1 / self._spectrum, kept.ravel()).reshape(3, *kept.shape)
 
     def frame(self, observation: Observation) -> VarianceMap:
-        """Return the maps of a whole frame from the cores of windows side by side.
-
-        Of windows with the same footprints one is solved, from which the others follow where their noise is similar.
-        """
+        """Return the maps of a whole frame from the cores of windows side by side."""
         applied, (rows, columns) = self._as_matrices(observation), self._stretches
-        places, alike = list(product(rows, columns)), list(np.ndindex(len(rows), len(columns)))
-        if self.task.finer == 1 and not is_narrow(self.task):
-            alike = list(product(self._first_alike(observation, 0), self._first_alike(observation, 1)))
-        shared = [first for first, count in Counter(alike).items() if count >= REPEATS]
 
-        def response(first: tuple[int, int]) -> Response:
-            row, column = rows[first[0]], columns[first[1]]
-            return self._response(applied, (row.first, column.first), (row.core, column.core))
-
-        def at(place: tuple[Stretch, Stretch], first: tuple[int, int]) -> FloatArray:
-            corner, core = (place[0].first, place[1].first), (place[0].core, place[1].core)
-            maps = None
-            if first in responses:
-                numbers = self._near(corner)
-                numbers = numbers[self._order(numbers, corner)]
-                if responses[first].noise.size == numbers.size:  # unless one lies at an edge of the window, by rounding
-                    maps = responses[first].maps(*(noise[numbers] for noise in self._noise))
-            return self.map(applied, corner, core) if maps is None else maps
+        def at(place: tuple[Stretch, Stretch]) -> FloatArray:
+            return self.map(applied, (place[0].first, place[1].first), (place[0].core, place[1].core))
 
         with one_thread(), ThreadPoolExecutor(processors()) as threads:
-            responses = dict(zip(shared, threads.map(response, shared), strict=True))
-            found = list(threads.map(at, places, alike))
+            found = list(threads.map(at, product(rows, columns)))
             if self.halo < self._longer.halo and not is_narrow(self.task):
                 found = list(map(np.multiply, found, self._by_longer_halo(applied, threads)))
         lines = [found[first : first + len(columns)] for first in range(0, len(found), len(columns))]
@@ -220,60 +151,6 @@ class Windows:
                 [Entries(Observation(observation.shape, tuple(own)).to_sparse(), observation.shape)] if few else own
             )
         return Observation(observation.shape, tuple(found))
-
-    @cached_property
-    def _noise(self) -> tuple[FloatArray, FloatArray]:
-        """Expected and actual noise, infinite and 0 where readings are not used: (M,) each."""
-        task = self.task
-        return task.on_all_measurements(task.expected_noise, np.inf), task.on_all_measurements(self.actual, 0.0)
-
-    @cached_property
-    def _even_noise(self) -> FloatArray:
-        """Expected noise that is even over each lens type, as of most readings: (M,)."""
-        parts = [self._noise[0][part] for part in self.task.model.camera.type_slices()]
-        medians = np.array([np.median(part) for part in parts])
-        return np.repeat(np.where(np.isfinite(medians), medians, 1.0), [part.size for part in parts])
-
-    def _response(self, observation: Observation, corner: tuple[int, int], core: Core) -> Response:
-        """Return the maps of the core of a window with even noise, and what they are for other noise."""
-        shape, numbers = self.shape, self._near(corner)
-        order, (matrix, beside) = self._order(numbers, corner), self._cut(observation, corner, numbers)
-        matrix, beside, numbers = matrix[order], beside[order], numbers[order]
-        noise, applied = self._even_noise[numbers] + beside, dense_or_sparse(matrix)
-        precision = gram(applied, 1 / noise) + self._precision
-        covariance, missing = columns_of_covariance(precision, 1 / self._spectrum, np.arange(shape[0] * shape[1]))
-        kept = np.arange(shape[0] * shape[1]).reshape(shape)[core]
-        pixels, of_c = kept.ravel(), applied @ covariance
-        of_d = applied @ (covariance @ (self._precision @ covariance[:, pixels]))
-        squares, products = (np.asarray(of_c[:, pixels] * each, np.float32) for each in (of_c[:, pixels], of_d))
-        leverage = np.asarray(matrix.multiply(of_c).sum(axis=1), np.float64).ravel()
-        waves = np.asarray(fft.dctn(of_c.reshape(-1, *shape), 2, axes=(1, 2), norm="ortho"))
-        prior_leverage = np.einsum("rc,irc->i", 1 / self._spectrum, np.square(waves))
-        posterior, missing = (each[kept] for each in (np.diagonal(covariance), missing))
-        return Response(posterior, missing, noise, beside, squares, products, leverage, prior_leverage)
-
-    def _order(self, numbers: IntArray, corner: tuple[int, int]) -> IntArray:
-        """Return the order of readings by lens type and place in a window, that of all windows with its footprints."""
-        camera = self.task.model.camera
-        ends = [part.stop for part in camera.type_slices()]
-        down, across = (
-            (middles[numbers] - first).round(PLACES) for middles, first in zip(camera.middles, corner, strict=True)
-        )
-        return np.lexsort((across, down, np.searchsorted(ends, numbers, "right")))
-
-    def _first_alike(self, observation: Observation, axis: int) -> list[int]:
-        """Return, for every window along an axis, the number of the first one with the same footprints.
-
-        Behind pinholes, displaced or not, they repeat with the period of all lens types together.
-        """
-        side, size, reach = self.shape[axis], self.task.shape_of_f[axis], observation.reach
-        patterns: list[Hashable] = []
-        for first, core in self._stretches[axis]:
-            before, after = min(first, reach), min(size - first - side, reach)  # where footprints lie in part beside it
-            wide, other = slice(first - before, first + side + after), slice(0, self.shape[1 - axis])
-            footprints = observation.signature(*((other, wide) if axis else (wide, other)))
-            patterns.append((before, after, core.start, core.stop, footprints))
-        return [patterns.index(each) for each in patterns]
 
     @property
     def _stretches(self) -> list[list[Stretch]]:

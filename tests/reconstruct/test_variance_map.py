@@ -216,7 +216,7 @@ def test_one_solution_measures_the_variances_of_distant_pixels(as_expected: bool
     gain = covariance @ (matrix.T.toarray() * weights)
     error = np.square(covariance).sum(axis=1) / P0 + np.square(gain) @ actual
     system = frame_system(frame_camera(shape), weights)
-    exact = ExactVariances(system, None if as_expected else weights**2 * actual, 0.01)
+    exact = ExactVariances(system, None if as_expected else weights**2 * actual, 0.01, task)
     posterior = np.ascontiguousarray(np.diagonal(covariance))
     assert check_map(error, posterior, shape, exact, local=True).worst < 2e-3
     wrong = check_map(1.05 * error, posterior, shape, exact, local=True)

@@ -64,21 +64,19 @@ class ExactVariances:
 
     noise : (M,) Rvm / Rv^2, None where the actual noise Rvm is the expected one
     accuracy : that of solutions in posterior standard deviations, if EXACT is out of reach
-    task : whose unknowns are finer than f's pixels; None: the unknowns are f's pixels
     """
 
     system: FrameSystem
     noise: FloatArray | None
     accuracy: float
-    task: EstimationTask | None = None
+    task: EstimationTask
 
     def at(self, pixels: Pixels, posterior: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return Eq. 5 of pixels whose errors are not correlated, (n,); posterior : (N,) about the diagonal of C."""
         signs = np.zeros_like(posterior)
         signs[pixels] = rng.choice([-1.0, 1.0], size=pixels.size)
         finest = EXACT * float(np.sqrt(posterior[pixels].min()))
-        weights = signs if self.task is None else self.task.of_unknowns(signs)
-        solved = self._solve(weights, finest)
+        solved = self._solve(self.task.of_unknowns(signs), finest)
         if self.noise is not None:
             readings = self.system.observation.forward(solved)
             if pixels.size == 1:  # the quadratic form is that of the pixel alone
@@ -86,12 +84,9 @@ class ExactVariances:
                 return np.array([missing + float(self.noise @ np.square(readings))])
             readings *= self.noise
             right = self.system.observation.adjoint(readings) + self.system.apply_prior_precision(solved)
-            smallest = float(np.min((signs * self._of_f(solved))[pixels]))
+            smallest = float(np.min((signs * self.task.of_f(solved))[pixels]))
             solved = self._solve(right, min(finest, EXACT * max(smallest, 0.0) / float(posterior.max()) ** 0.5))
-        return (signs * self._of_f(solved))[pixels]
-
-    def _of_f(self, image: FloatArray) -> FloatArray:
-        return image if self.task is None else self.task.of_f(image)
+        return (signs * self.task.of_f(solved))[pixels]
 
     def _solve(self, right: FloatArray, accuracy: float) -> FloatArray:
         try:

@@ -31,7 +31,7 @@ from ..output.run_json import HeldOutEntry, HeldOutPrior, HeldOutReport, HeldOut
 from ..prior import FittedPrior
 from ..prior_fit import fit_prior
 from ..verdict.causes import likely_cause
-from .windows import HeldOutSums, held_out_sums, windows
+from .windows import held_out_sums, windows
 
 SIGNIFICANCE = 1e-4  # of all sub-imagers together
 LEAST_EXCESS = 0.1  # of the sum of squares over its expectation
@@ -133,7 +133,7 @@ def _check(task: EstimationTask, execution: Execution, *, fitted: bool) -> HeldO
     disagreeing = _disagreeing(first)
     named, sums = _culprits(task, execution, first)
     for index, before in named.items():
-        sums = sums.replaced(index, before)
+        sums[:, index] = before[:, index]
     subs = tuple(
         _sub_imager(sub, index, sums, bool(disagreeing[index]), index in named)
         for index, sub in enumerate(task.model.camera.sub_imagers)
@@ -176,13 +176,13 @@ def quick_check(stack: Stack, task: EstimationTask, method: str) -> HeldOutRepor
 
 
 def _culprits(
-    task: EstimationTask, execution: Execution, first: HeldOutSums
-) -> tuple[dict[int, HeldOutSums], HeldOutSums]:
+    task: EstimationTask, execution: Execution, first: FloatArray
+) -> tuple[dict[int, FloatArray], FloatArray]:
     """Return the sub-imagers after whose removal all others agree, none if there are no such, and the others' sums.
 
     Of each that is removed, the sums are those before its removal.
     """
-    named: dict[int, HeldOutSums] = {}
+    named: dict[int, FloatArray] = {}
     last = first
     while (disagreeing := _disagreeing(last)).any():
         if len(named) == MOST_NAMED:
@@ -204,29 +204,29 @@ def _without(task: EstimationTask, left_out: tuple[int, ...]) -> EstimationTask:
     return replace(task, used=kept, expected_noise=task.expected_noise[kept[task.used]])
 
 
-def _excess(sums: HeldOutSums) -> FloatArray:
+def _excess(sums: FloatArray) -> FloatArray:
     """Sums of squares above their expectation: (sub-imagers,)."""
-    return sums.chi_squared - sums.pixels
+    return sums[1] - sums[0]
 
 
-def _log_p(sums: HeldOutSums) -> FloatArray:
+def _log_p(sums: FloatArray) -> FloatArray:
     """Logarithm of the probability of a larger sum of squares: (sub-imagers,), NaN without pixels."""
-    result = np.full(sums.pixels.size, np.nan)
-    judged = sums.pixels > 0
-    result[judged] = log_survival(sums.chi_squared[judged], sums.pixels[judged].astype(np.float64))
+    result, (pixels, chi_squared, _) = np.full(sums.shape[1], np.nan), sums
+    judged = pixels > 0
+    result[judged] = log_survival(chi_squared[judged], pixels[judged])
     return result
 
 
-def _disagreeing(sums: HeldOutSums) -> BoolArray:
-    count = int(np.sum(sums.pixels > 0))
+def _disagreeing(sums: FloatArray) -> BoolArray:
+    count = int(np.sum(sums[0] > 0))
     limit = np.log(-np.expm1(np.log1p(-SIGNIFICANCE) / max(count, 1)))
     with np.errstate(invalid="ignore"):  # NaN without pixels
-        return (_log_p(sums) < limit) & (_excess(sums) > LEAST_EXCESS * sums.pixels)
+        return (_log_p(sums) < limit) & (_excess(sums) > LEAST_EXCESS * sums[0])
 
 
-def _familywise(sums: HeldOutSums) -> float | None:
+def _familywise(sums: FloatArray) -> float | None:
     """Probability that the largest deviation of all is larger by chance (Sidak)."""
-    count = int(np.sum(sums.pixels > 0))
+    count = int(np.sum(sums[0] > 0))
     if not count:
         return None
     least = float(np.exp(np.nanmin(_log_p(sums))))
@@ -240,11 +240,12 @@ def _deviate(log_p: float, chi_squared: float, freedoms: int) -> float:
     return max(float(special.ndtri(special.gammainc(freedoms / 2, chi_squared / 2))), LEAST_DEVIATE)
 
 
-def _sub_imager(sub: SubImager, index: int, sums: HeldOutSums, disagrees: bool, named: bool) -> HeldOutEntry:
-    pixels, chi_squared = int(sums.pixels[index]), float(sums.chi_squared[index])
+def _sub_imager(sub: SubImager, index: int, sums: FloatArray, disagrees: bool, named: bool) -> HeldOutEntry:
+    of_pixels, chi_squared, precision = sums[:, index].tolist()
+    pixels = int(of_pixels)
     numbers: dict[str, float | None] = dict.fromkeys(("z", "p_value", "rms_error", "expected_rms"))
     if pixels:
-        log_p, precision = float(_log_p(sums)[index]), float(sums.precision[index])
+        log_p = float(_log_p(sums)[index])
         numbers = {
             "z": _deviate(log_p, chi_squared, pixels),
             "p_value": float(np.exp(log_p)),

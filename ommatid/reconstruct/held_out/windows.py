@@ -35,33 +35,6 @@ MOST_WINDOWS = 8  # along each axis; of larger frames so many at equal distances
 
 
 @dataclass(frozen=True)
-class HeldOutSums:
-    """Sums over the predicted pixels of each sub-imager: (sub-imagers,) each.
-
-    pixels : how many;  chi_squared : of the whitened errors;  precision : of the diagonals of W
-    """
-
-    pixels: IntArray
-    chi_squared: FloatArray
-    precision: FloatArray
-
-    def replaced(self, index: int, other: HeldOutSums) -> HeldOutSums:
-        """Return the sums with those of one sub-imager taken from others."""
-        here = np.arange(self.pixels.size) == index
-        return HeldOutSums(
-            np.where(here, other.pixels, self.pixels),
-            np.where(here, other.chi_squared, self.chi_squared),
-            np.where(here, other.precision, self.precision),
-        )
-
-    def __add__(self, other: HeldOutSums) -> HeldOutSums:
-        """Add the sums of another window."""
-        return HeldOutSums(
-            self.pixels + other.pixels, self.chi_squared + other.chi_squared, self.precision + other.precision
-        )
-
-
-@dataclass(frozen=True)
 class WindowProblem:
     """A problem with its measurements, and the sub-imager of each: (m,)."""
 
@@ -82,10 +55,11 @@ def windows(task: EstimationTask) -> tuple[list[Window], int]:
     return [(down, across) for down, across in shown], len(rows) * len(columns)
 
 
-def held_out_sums(task: EstimationTask, execution: Execution) -> HeldOutSums:
-    """Predict the used pixels of every sub-imager from all others, and sum their squares.
+def held_out_sums(task: EstimationTask, execution: Execution) -> FloatArray:
+    """Predict the used pixels of every sub-imager from all others: (3, sub-imagers).
 
-    Sums are 0 where there are no others to predict from.
+    The rows are their number, the sums of the squares of their whitened errors, and of the diagonals of W; 0 where
+    there are no others to predict from.
     """
     if ReadingSpace.serves(task):
         return _sums(_light(task))
@@ -94,10 +68,7 @@ def held_out_sums(task: EstimationTask, execution: Execution) -> HeldOutSums:
         return _sums(next(_problems(task, chosen)))
     with one_thread(), worker_pool(threads=processors()) as pool:
         parts = pool.map(_sums, _problems(task, chosen), execution.progress, len(chosen))
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
+    return np.sum(parts, axis=0)
 
 
 def _intervals(size: int, side: int) -> list[slice]:
@@ -176,16 +147,13 @@ def _with_unknowns(
     return joined, Prior(np.concatenate([prior.mean, np.zeros(count)]), root, prior.rounding)
 
 
-def _sums(window: WindowProblem) -> HeldOutSums:
+def _sums(window: WindowProblem) -> FloatArray:
     present = np.unique(window.sub_imager)
     blocks = [np.flatnonzero(window.sub_imager == index) for index in present]
-    pixels = np.zeros(window.count, dtype=np.int64)
-    chi_squared, precision = np.zeros(window.count), np.zeros(window.count)
+    sums = np.zeros((3, window.count))
     if present.size < 2:  # nothing to predict from
-        return HeldOutSums(pixels, chi_squared, precision)
+        return sums
     errors = block_errors(window.problem, window.recorded, blocks)
     for index, block in zip(present, errors, strict=True):
-        pixels[index] = block.whitened.size
-        chi_squared[index] = float(block.whitened @ block.whitened)
-        precision[index] = float(block.precision.sum())
-    return HeldOutSums(pixels, chi_squared, precision)
+        sums[:, index] = block.whitened.size, block.whitened @ block.whitened, block.precision.sum()
+    return sums

@@ -16,16 +16,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.input_files import read_any_text, real_path
 
 from ..tables import glass, toml
 from ..tables.camera import MOST_SURFACES, SURFACES, CameraTable, Surface
-from ..tables.messages import explain
+from ..tables.messages import validated
 from ..tables.table import Table
-from .zemax import Catalogue, read_catalogue, read_zmx
+from .zemax import Catalogue, number, read_catalogue, read_zmx
 
 LARGEST = 10**6  # bytes
 COLUMNS = "radius, thickness, index of refraction, diameter"
@@ -105,15 +105,16 @@ def _from_toml(text: str, path: Path) -> tuple[Surface, ...]:
         data = toml.loads(text)
     except ValueError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from error
-    try:
-        return LensFile.model_validate(data).surfaces
-    except ValidationError as error:
-        raise InputError(f"{path}: {explain(error, data, LensFile)}") from error
+    return validated(LensFile, data, str(path)).surfaces
 
 
 def _from_rows(text: str, path: Path) -> tuple[Surface, ...]:
     lines = [line.partition("#")[0].split() for line in text.splitlines()]
-    rows = [(number, _numbers(words, path, number)) for number, words in enumerate(lines, start=1) if words]
+    rows = [
+        (line, [number(word, f"{path}, line {line}", COLUMNS) for word in words])
+        for line, words in enumerate(lines, start=1)
+        if words
+    ]
     if rows and len(rows[0][1]) == 1:
         del rows[0]  # the focal length, which follows from the surfaces
     if not rows:
@@ -122,25 +123,12 @@ def _from_rows(text: str, path: Path) -> tuple[Surface, ...]:
         raise InputError(f"{path}: expected at most {MOST_SURFACES} surfaces, got {len(rows)}")
     surfaces: list[Surface] = []
     before = 1.0
-    for number, values in rows:
+    for line, values in rows:
         if len(values) != 4:
-            raise InputError(f"{path}, line {number}: expected four numbers ({COLUMNS}), got {len(values)}")
-        surfaces.append(_surface(values, before, last=number == rows[-1][0], where=f"{path}, line {number}"))
+            raise InputError(f"{path}, line {line}: expected four numbers ({COLUMNS}), got {len(values)}")
+        surfaces.append(_surface(values, before, last=line == rows[-1][0], where=f"{path}, line {line}"))
         before = values[2] or 1.0
     return tuple(surfaces)
-
-
-def _numbers(words: list[str], path: Path, number: int) -> list[float]:
-    values: list[float] = []
-    for word in words:
-        try:
-            value = float(word)
-        except ValueError:
-            value = float("nan")
-        if not abs(value) < 1e9:
-            raise InputError(f"{path}, line {number}: expected numbers ({COLUMNS}), got '{shortened(word)}'")
-        values.append(value)
-    return values
 
 
 def _surface(values: list[float], before: float, *, last: bool, where: str) -> Surface:
@@ -159,7 +147,4 @@ def _surface(values: list[float], before: float, *, last: bool, where: str) -> S
     if index > 1:
         table["index"] = index
     table["stop"] = radius == 0 and (index == 0 or index == before == 1)
-    try:
-        return Surface.model_validate(table)
-    except ValidationError as error:
-        raise InputError(f"{where}: {explain(error, table, Surface)}") from error
+    return validated(Surface, table, where)

@@ -25,14 +25,12 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from ommatid.runtime.errors import InputError, shortened
 from ommatid.runtime.input_files import read_any_text
 
 from ..optics.dispersion import COEFFICIENTS, Dispersion
 from ..tables.camera import MOST_SURFACES, Surface
-from ..tables.messages import explain
+from ..tables.messages import validated
 
 LARGEST = 2**24  # bytes; the largest catalogues of glass makers have one million
 EXTREME = 1e9  # largest number
@@ -85,10 +83,7 @@ class Catalogue:
             "shortest": f"{shortest!r} um",
             "longest": f"{longest!r} um",
         }
-        try:
-            return Dispersion.model_validate(data)
-        except ValidationError as error:
-            raise InputError(f"{where}: {explain(error, data, Dispersion)}") from error
+        return validated(Dispersion, data, where)
 
 
 def read_catalogue(path: Path) -> Catalogue:
@@ -277,7 +272,4 @@ def _surface(table: dict[str, Any]) -> Surface:
         raise InputError(f"{where}: expected a semi-diameter (DIAM) above 0, got {table['semi_diameter']:g} mm")
     lengths = {"thickness": thickness, "semi_diameter": table["semi_diameter"], "radius": table.get("radius", 0.0)}
     data = table | {name: f"{value!r} mm" for name, value in lengths.items() if value}
-    try:
-        return Surface.model_validate(data)
-    except ValidationError as error:
-        raise InputError(f"{where}: {explain(error, data, Surface)}") from error
+    return validated(Surface, data, where)

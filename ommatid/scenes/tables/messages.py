@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import difflib
 import re
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from ommatid.runtime.errors import named, shortened_repr
+from ommatid.runtime.errors import InputError, named, shortened_repr
 from ommatid.runtime.printable import printable
 
+Model = TypeVar("Model", bound=BaseModel)
 LONGEST = 100  # characters of a key that is compared with the known ones
 SHORTEST = 3  # characters of the beginning of a key
 # What was expected, by pydantic's type of a problem; names in braces are those of its context.
@@ -57,6 +58,14 @@ def explain(error: ValidationError, data: dict[str, Any], model: type[BaseModel]
     sentence = _sentence(location, ours or branches, data, keys)
     others = len(of_key) - 1
     return sentence + (f" (and {others} more to correct)" if others else "")
+
+
+def validated(model: type[Model], data: dict[str, Any], where: str) -> Model:
+    """Return a table of a file. Raises InputError that begins with `where` for one with errors."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{where}: {explain(error, data, model)}") from error
 
 
 def known_keys(model: type[BaseModel], prefix: str = "") -> list[str]:

@@ -52,37 +52,20 @@ class Seen:
 
 
 class Back:
-    """A sum of H^T g over parts: those that add pixels, lines of them, and those that add Fourier coefficients."""
+    """A sum of H^T g over parts: those that add pixels, and those that add Fourier coefficients."""
 
     def __init__(self, shape: tuple[int, int], padded: tuple[int, int]) -> None:
         """Begin with 0."""
         self.shape, self.padded = shape, padded
         self._image: FloatArray | None = None
         self._spectrum: ComplexArray | None = None
-        self._lines: list[tuple[sparse.csc_array, FloatArray]] = []
 
     def add(self, other: Back) -> None:
         """Add another sum, which is not needed any more."""
-        self._lines += other._lines
         if other._image is not None:
             self.add_image(other._image)
         if other._spectrum is not None:
             self.add_spectrum(other._spectrum)
-
-    def add_lines(self, rows: sparse.csc_array, lines: FloatArray) -> None:
-        """Add rows @ lines; rows : (rows of f, k), lines : (k, columns of f)."""
-        self._lines.append((rows, lines))
-
-    def spread_lines(self) -> None:
-        """Add all lines to the image at once, which writes each of its pixels once."""
-        if self._lines:
-            (rows, *more), (lines, *others) = zip(*self._lines, strict=True)
-            self._lines = []
-            if more:  # by rows, as SciPy takes them, whatever the order of the parts
-                parts = lines, *others
-                lines = np.concatenate(parts, out=np.empty((sum(map(len, parts)), self.shape[1])))
-                rows = sparse.hstack((rows, *more), format="csc")
-            self.add_image(np.asarray(rows @ lines))
 
     def add_image(self, image: FloatArray) -> None:
         """Add an image, (rows, columns), which is not needed any more."""
@@ -105,7 +88,6 @@ class Back:
             whole = np.asarray(fft.irfft2(self._spectrum, self.padded, workers=processors(), overwrite_x=True))
             self.add_image(np.ascontiguousarray(whole[: self.shape[0], : self.shape[1]]))
             self._spectrum = None
-        self.spread_lines()
         return np.zeros(self.shape) if self._image is None else self._image
 
 
@@ -323,7 +305,6 @@ class Observation:
             back = Back(self.shape, self._padded)
             for part, place in zip(self.parts[group], self.slices[group], strict=True):
                 part.adjoint(readings[place], back)
-            back.spread_lines()
             return back
 
         backs = self._each(spread)

@@ -98,7 +98,7 @@ class Box(ObservationPart):
 
     def adjoint(self, readings: FloatArray, back: Back) -> None:
         """Add H^T g to `back`; readings : (measurements,)."""
-        back.add_lines(self.down.shares.T, self.lens_type.by_lines(readings) @ self.across.shares)
+        back.add_image(self.down.shares.T @ (self.lens_type.by_lines(readings) @ self.across.shares))
 
     def to_sparse(self) -> sparse.csr_array:
         """Return H as a matrix: (measurements, N)."""

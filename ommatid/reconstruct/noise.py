@@ -29,7 +29,7 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from .coarse_model import model_of_f
-from .methods.method import EstimationTask, is_uniform, total_variance
+from .methods.method import EstimationTask, total_variance
 from .prior import coloured, spectrum_of
 from .prior_fit import PriorFit
 
@@ -93,9 +93,7 @@ def known_noise(stack: Stack, light: FloatArray | None = None) -> Noise:
 
     light : (M,) that an estimate predicts, absent: the readings near each pixel
     """
-    rendering = stack.rendering_variance
-    rendering = rendering if rendering.any() else uniform(0.0, rendering.size)
-    return {"rendering": rendering} | stack.sensor_noise(light)
+    return {"rendering": stack.rendering_variance} | stack.sensor_noise(light)
 
 
 def noise_at(stack: Stack, model: Model, image: FloatArray) -> Noise:
@@ -108,7 +106,7 @@ def fitted_noise(noise: Noise, fit: PriorFit | None) -> Noise:
     """Return the noise whose part that is not CERTAIN is replaced by the fitted one, if one was fitted."""
     if fit is None or fit.noise_variance is None:
         return noise
-    return {**certain(noise), "noise": uniform(fit.noise_variance, noise["rendering"].size)}
+    return {**certain(noise), "noise": np.full(noise["rendering"].size, fit.noise_variance)}
 
 
 def certain(noise: Noise) -> Noise:
@@ -146,7 +144,7 @@ class ObservedStack:
             noise["calibration"] = model.prior_variance_from_model(variances, prior.mean)
         if self.usable.censoring is not None:
             noise[SATURATION] = self.usable.censoring
-        noise = {name: at_used(variances, self.usable.used) for name, variances in noise.items()}
+        noise = {name: variances[self.usable.used] for name, variances in noise.items()}
         return self.with_shared(noise, image) if shared else noise
 
     def with_shared(self, noise: Noise, image: FloatArray | None) -> Noise:
@@ -179,7 +177,7 @@ class ObservedStack:
         setting = self.stack.scene.estimator.noise_variance
         if not isinstance(setting, float):
             return total_variance(noise)
-        return uniform(setting, int(self.usable.used.sum())) + noise.get(SATURATION, 0.0)
+        return np.full(int(self.usable.used.sum()), setting) + noise.get(SATURATION, 0.0)
 
     @property
     def expects_fixed_noise(self) -> bool:
@@ -221,11 +219,6 @@ def check_noise_fit(stack: Stack) -> None:
         )
 
 
-def uniform(number: float, count: int) -> FloatArray:
-    """Return an array that repeats one number `count` times and stores it once."""
-    return np.broadcast_to(np.float64(number), (count,))
-
-
 def undithered(noise: Noise) -> float | None:
     """Return the noise over the quantisation step where it is below DITHER, None elsewhere; noise : by cause."""
     rounding = noise.get("quantisation")
@@ -263,13 +256,6 @@ def of_smooth_parts(values: FloatArray, observation: Observation) -> FloatArray:
     """
     seen, total = observation.adjoint(np.ones(values.size)), observation.adjoint(values)
     return observation.forward(np.divide(total, seen, out=np.zeros_like(seen), where=seen > 0))
-
-
-def at_used(values: FloatArray, used: BoolArray) -> FloatArray:
-    """Return the values, of (M,), at the pixels used."""
-    if used.all():
-        return values
-    return uniform(float(values[0]), int(used.sum())) if is_uniform(values) else values[used]
 
 
 def censored(

@@ -27,8 +27,8 @@ from .coarse_model import CAUSE as DETAIL
 from .expected_error import ExpectedError, Interval
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
-from .methods.method import EstimationTask, Execution, Method, MethodResult, Prepared, is_uniform, total_variance
-from .noise import Noise, UsablePixels, undithered, uniform
+from .methods.method import EstimationTask, Execution, Method, MethodResult, Prepared, total_variance
+from .noise import Noise, UsablePixels, undithered
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
 from .prior_fit import PriorFit
 from .verdict.causes import likely_cause
@@ -133,7 +133,7 @@ def _whitened(stack: Stack, model: Model, assumed: Assumptions, result: MethodRe
         used=assumed.usable.used,
         spread=_spread(stack, assumed, total),
         shared=_shared(model, assumed, total),
-        largest=max(1.0, _largest_ratio(total, expected_noise), assumed.method.task.prior_ratio),
+        largest=max(1.0, float((total / expected_noise).max()), assumed.method.task.prior_ratio),
     )
 
 
@@ -141,24 +141,17 @@ def _spread(stack: Stack, assumed: Assumptions, total: FloatArray) -> FloatArray
     """Return the relative variance of the noise variances, which the rendering estimates from few passes."""
     freedoms = max(int(stack.record.get("passes") or 0) - 1, LEAST_FREEDOMS)
     if not assumed.noise["rendering"].any():
-        return uniform(0.0, total.size)
+        return np.zeros(total.size)
     share = np.divide(assumed.noise["rendering"], total, out=np.zeros(total.size), where=total > 0)
     np.square(share, out=share)
     share *= 2 / (freedoms - 4)
     return share
 
 
-def _largest_ratio(total: FloatArray, expected: FloatArray) -> float:
-    """Return the largest ratio of the actual to the expected noise variance."""
-    if is_uniform(total) and is_uniform(expected):
-        total, expected = total[:1], expected[:1]
-    return float((total / expected).max())
-
-
 def _shared(model: Model, assumed: Assumptions, total: FloatArray) -> FloatArray:
     """Return the share of the noise that the few errors per sub-imager of a fitted geometry cause."""
     if not model.record.get("fit") or "calibration" not in assumed.noise:
-        return uniform(0.0, total.size)
+        return np.zeros(total.size)
     return np.divide(assumed.noise["calibration"], total, out=np.zeros(total.size), where=total > 0)
 
 

@@ -33,7 +33,7 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.observation import Observation
 
-from ..methods.method import EstimationTask, is_uniform
+from ..methods.method import EstimationTask
 from .bands import Bands, bands_of, leaves_null_space
 
 Indices = NDArray[np.intp]
@@ -307,10 +307,7 @@ class Refined:
 
 def frame_system(task: EstimationTask) -> FrameSystem:
     """Return the system of a task whose every measurement has noise."""
-    if is_uniform(task.expected_noise) and task.complete:
-        weights = np.broadcast_to(1 / task.expected_noise[:1], task.expected_noise.shape)
-    else:
-        weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
+    weights = task.on_all_measurements(1 / task.expected_noise, 0.0)
     prior, observation, camera = task.precision_on(task.shape), task.model.applied, task.model.camera
     spectrum = np.broadcast_to(1 / np.asarray(prior), task.shape)
     bands = bands_of(camera, task.finer, spectrum, weights, observation)

@@ -77,8 +77,6 @@ def relative_difference(values: FloatArray, others: FloatArray) -> float:
     """Return the least d with which all values are between 1 / (1 + d) and 1 + d times the others; all 0 or more."""
     if values.shape != others.shape:
         return inf
-    if values.strides == others.strides == (0,):
-        values, others = values[:1], others[:1]
     if np.array_equal(values, others):
         return 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -473,7 +471,7 @@ class Method(ABC):
         ratio = self.task.prior_ratio
         if ratio == 1:
             return self.result_for_assumed_prior(noise, truth)
-        scaled = {name: _divided(values, ratio) for name, values in noise.items()}
+        scaled = {name: values / ratio for name, values in noise.items()}
         mean = self.task.prior.mean
         closer = None if truth is None else mean + (truth - mean) / ratio**0.5
         return _multiplied(self.result_for_assumed_prior(scaled, closer), ratio)
@@ -534,24 +532,18 @@ def _multiplied(result: MethodResult, ratio: float) -> MethodResult:
     return replace(result, expected=expected, interval=given, variance_of_sum=variance_of_sum, residual_power=power)
 
 
-def _divided(values: FloatArray, ratio: float) -> FloatArray:
-    return np.broadcast_to(values[0] / ratio, values.shape) if is_uniform(values) and values.size else values / ratio
-
-
 def total_variance(noise: dict[str, FloatArray]) -> FloatArray:
-    """Return the sum of the variances of all causes; uniform if every one of them is."""
-    variances = list(noise.values())
-    if all(is_uniform(variance) for variance in variances):
-        return np.broadcast_to(sum(float(variance[0]) for variance in variances if variance.size), variances[0].shape)
-    total = np.array(variances[0])
-    for variance in variances[1:]:
+    """Return the sum of the variances of all causes."""
+    first, *others = noise.values()
+    total = np.array(first)
+    for variance in others:
         total += variance
     return total
 
 
 def is_uniform(values: FloatArray) -> bool:
-    """Return True if an array repeats one number that is stored once (or is empty)."""
-    return values.strides == (0,) or values.size == 0
+    """Return True if an array repeats one number, or is empty."""
+    return values.size == 0 or not np.ptp(values)
 
 
 def residual_multipliers(task: EstimationTask, image: FloatArray) -> FloatArray:

@@ -30,7 +30,6 @@ from .method import (
     Method,
     MethodResult,
     PosteriorOperators,
-    is_uniform,
     residual_multipliers,
     total_variance,
 )
@@ -187,13 +186,10 @@ class TileMethod(Method):
     def _key(self, tile: Tile, noise: dict[str, FloatArray]) -> object:
         """A key that is equal for tiles with the same H, noise and core."""
         task = self.task
-        varied = [values for values in (task.expected_noise, *noise.values()) if not is_uniform(values)]
-        digests: list[str] = []
-        if varied or not task.complete:
-            inside = task.model.windowed.measurements_inside(*tile.window)
-            index = task.among_used(task.used_inside(*tile.window))
-            digests = [digest(task.used[inside]), *(digest(values[index]) for values in varied)]
-        return task.model.windowed.signature(*tile.window), tile.shape, tile.kept.tobytes(), *digests
+        inside = task.model.windowed.measurements_inside(*tile.window)
+        index = task.among_used(task.used_inside(*tile.window))
+        same = digest(task.used[inside], task.expected_noise[index], *(values[index] for values in noise.values()))
+        return task.model.windowed.signature(*tile.window), tile.shape, tile.kept.tobytes(), same
 
     def _tile_task(
         self,

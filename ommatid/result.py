@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -85,7 +85,6 @@ class Result:
         from ommatid.page.data import Run
         from ommatid.page.sections import page
         from ommatid.runtime.files import write_text
-        from ommatid.simulate.ideal import matrix_as_designed
 
         run = Run(
             folder=Path(path).parent,
@@ -96,8 +95,7 @@ class Result:
             variance=np.square(self.deviation).astype(np.float32),
             truth=None if self.truth is None else self.truth.astype(np.float32),
         )
-        ideal = partial(matrix_as_designed, self.stack.camera)
-        write_text(Path(path), page(run, ideal, None, self.summary.fingerprint))
+        write_text(Path(path), page(run, None, self.summary.fingerprint))
         return Path(path)
 
     def to_xarray(self) -> xarray.Dataset:

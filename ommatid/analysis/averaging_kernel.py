@@ -125,7 +125,7 @@ def why_none(scene: Scene) -> str:
     if misalignment == "trust":
         return ""
     return (
-        "Transfer function, response to an edge, intervals of the measured errors and the effect of another lens type"
+        "Transfer function, intervals of the measured errors and the effect of another lens type"
         f" are not computed for `estimator.misalignment = '{misalignment}'`, whose errors are correlated otherwise."
     )
 

@@ -11,8 +11,9 @@ import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_whole
@@ -105,16 +106,22 @@ def log_ticks(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def svg_text(figure: Any) -> str:
+def svg_text(figure: Any, name: str, description: str = "") -> str:
     """Return a figure as an `svg` element for a page: transparent, with black in the colour of the page's text.
 
     Its width is that of the element around it.
+
+    name : unique on the page, the element's identity;  description : for readers who do not see it
     """
-    file = io.StringIO()
-    with own_style():
+    import matplotlib
+
+    file, module = io.StringIO(), cast(Any, matplotlib)
+    with own_style(), module.rc_context({"svg.hashsalt": name}):
         figure.savefig(file, format="svg", transparent=True, metadata=DATE["svg"])
     text = re.sub(r"\A.*?(?=<svg)|<metadata>.*?</metadata>|<!--.*?-->", "", file.getvalue(), flags=re.DOTALL)
-    text = re.sub(r' id="[a-z]+[0-9.]*_[0-9]+"', "", text)  # of groups; several figures of a page share these names
+    used = set(re.findall(r"#([\w.-]+)", text))
+    text = re.sub(r' id="([^"]*)"', lambda found: found[0] if found[1] in used else "", text)  # groups of any figure
     head, rest = text.split(">", 1)
     head = re.sub(r' (width|height)="[^"]*"', "", head)
-    return f'{head} role="img" fill="currentColor">{rest.replace(INK, "currentColor")}'
+    words = f' aria-label="{escape(description)}"' if description else ""
+    return f'{head} id="{name}" role="img"{words} fill="currentColor">{rest.replace(INK, "currentColor")}'

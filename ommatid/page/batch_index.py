@@ -213,21 +213,18 @@ def words(entries: list[BatchEntry], noun: str = "scenes") -> str:
 
 def _scenes_figure(entries: list[BatchEntry]) -> Markup:
     """Draw measured against predicted error; nothing if there is nothing to compare."""
-    errors = [(entry.title, entry.report.error) for entry in entries if entry.report]
-    scenes = [(title, error) for title, error in errors if error.mse and error.predicted_mse]
-    if len(scenes) < 2:
+    errors = [entry.report.error for entry in entries if entry.report]
+    points = [(each.predicted_mse, each.mse, each.expected_given_truth) for each in errors if each.predicted_mse]
+    points = [(predicted, measured, given) for predicted, measured, given in points if measured]
+    if len(points) < 2:
         return Markup("")
-    points = [(title, error.predicted_mse, error.mse or 0.0, error.expected_given_truth) for title, error in scenes]
     dots = ChartSeries(
         "measured, with the 99 % interval expected for the image",
-        [predicted for _, predicted, _, _ in points],
-        [measured for _, _, measured, _ in points],
+        [predicted for predicted, _, _ in points],
+        [measured for _, measured, _ in points],
         "dots",
-        low=[measured if given is None else given.low for _, _, measured, given in points],
-        high=[measured if given is None else given.high for _, _, measured, given in points],
-        tips=[
-            f"{title}: predicted {predicted:.4g}, measured {measured:.4g}" for title, predicted, measured, _ in points
-        ],
+        low=[measured if given is None else given.low for _, measured, given in points],
+        high=[measured if given is None else given.high for _, measured, given in points],
     )
     ends = [min(dots.x), max(dots.x)]
     equal = ChartSeries("measured equals predicted", ends, ends, "dashed", 0)

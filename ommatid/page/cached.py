@@ -6,7 +6,6 @@ import hashlib
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ommatid.bench.table import bench_tables
 from ommatid.reconstruct.output.run_json import RunReport, of_stages
@@ -18,9 +17,6 @@ from ommatid.scenes.stack import Stack
 
 from .data import read_run
 
-if TYPE_CHECKING:
-    from .panels.point_response import IdealMatrix
-
 REPORT = "report.html"
 HERE = Path(__file__).parent
 DRAWN = HERE.parent / "analysis" / "quality", HERE.parent / "figures"  # folders of what the pages draw
@@ -28,15 +24,11 @@ HEAD, TAIL = 4096, 64  # bytes at the beginning of a page that contain its stamp
 
 
 def cached_page(
-    folder: Path,
-    report: RunReport,
-    ideal: IdealMatrix | None,
-    recorded: Stack | None = None,
-    calibrated: Model | None = None,
+    folder: Path, report: RunReport, recorded: Stack | None = None, calibrated: Model | None = None
 ) -> bool:
     """Write report.html of a run unless it is up to date, and return True if it was written.
 
-    report : of the run, of which times of files and of the page do not count;  ideal : H of one sub-imager as designed
+    report : of the run, of which times of files and of the page do not count
     recorded, calibrated : the stack and the model in the folder, None to read them
     Raises InputError for missing or damaged files, MachineError for a full disk.
     """
@@ -49,7 +41,7 @@ def cached_page(
     def make() -> str:
         from .sections import page
 
-        return page(read_run(folder, report, recorded, calibrated), ideal, bench, stamp)
+        return page(read_run(folder, report, recorded, calibrated), bench, stamp)
 
     return cached(folder / REPORT, stamp, read_stamp, make, write_text)[1]
 

@@ -18,14 +18,13 @@ from ommatid.analysis.baselines import known_baselines
 from ommatid.reconstruct.measured_error import best_single_sub_image, enlarged
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
-from ommatid.reconstruct.output.run_json import RunReport, of_stages
+from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.input_files import real_path
 from ommatid.runtime.printable import printable
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.model import Model
-from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 
 MOST_PIXELS = 2**16  # of a map on a page: three such maps as float32 are a megabyte of text
@@ -51,12 +50,7 @@ class Run:
     @property
     def title(self) -> str:
         """Title of the scene, or the name of the folder if it has none."""
-        return title_of(self.stack.scene, self.folder)
-
-
-def title_of(scene: Scene | None, folder: Path) -> str:
-    """Return the title of a scene, or the name of the folder if it has none."""
-    return printable((scene.title if scene is not None else "") or real_path(folder).name)
+        return printable(self.stack.scene.title or real_path(self.folder).name)
 
 
 @dataclass(frozen=True)
@@ -64,7 +58,7 @@ class ResultMaps:
     """Maps of a run as the page shows them: means over blocks of `block` x `block` pixels.
 
     deviation : posterior standard deviation of a pixel, the square root of the mean variance in a block
-    single : the best single sub-image on the grid of the image, None where the truth is not known
+    single : a sub-image on the grid of the image
     others : images of other methods by name
     """
 
@@ -72,9 +66,9 @@ class ResultMaps:
     columns: int
     block: int
     estimate: Float32Array
-    deviation: Float32Array | None
+    deviation: Float32Array
     truth: Float32Array | None
-    single: Float32Array | None = None
+    single: Float32Array
     others: Mapping[str, Float32Array] = field(default_factory=dict[str, Float32Array])
 
     @property
@@ -114,22 +108,11 @@ def _others(folder: Path, report: RunReport) -> Mapping[str, Float32Array]:
     return {} if known is None else {name: image for name, image in known.images.items() if name != "single"}
 
 
-def read_parts(folder: Path) -> dict[str, Any]:
-    """Read what a folder holds of a run: those of the fields of `Run` that are there. Raises InputError for damage."""
-    stack_path, model_path = folder / "stack.exr", folder / "model.npz"
-    return {
-        **(read_estimate(folder / ESTIMATE).channels if (folder / ESTIMATE).exists() else {}),
-        **({"report": of_stages(run_json.read(folder))} if (folder / run_json.RUN).exists() else {}),
-        **({"stack": stack.read(stack_path)} if stack_path.exists() else {}),
-        **({"model": model_file.read(model_path)} if model_path.exists() else {}),
-    }
-
-
 def maps(
     estimate: Float32Array,
-    variance: Float32Array | None,
+    variance: Float32Array,
     truth: Float32Array | None,
-    single: FloatArray | None = None,
+    single: FloatArray,
     others: Mapping[str, Float32Array] | None = None,
 ) -> ResultMaps:
     """Return the maps of an estimate with at most MOST_PIXELS blocks (a few more with partial blocks at the edges)."""
@@ -140,9 +123,9 @@ def maps(
         columns=columns,
         block=block,
         estimate=reduced(estimate, block),
-        deviation=None if variance is None else np.sqrt(reduced(variance, block)),
+        deviation=np.sqrt(reduced(variance, block)),
         truth=None if truth is None else reduced(truth, block),
-        single=None if single is None else reduced(single, block),
+        single=reduced(single, block),
         others={name: reduced(image, block) for name, image in (others or {}).items()},
     )
 

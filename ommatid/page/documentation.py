@@ -27,8 +27,6 @@ PAGES = {
     "baselines": ("The report: other methods", "report", "other-methods"),
     "groups": ("The report: measured and predicted error", "report", "how-to-read-measured-and-predicted-error"),
     "held-out": ("Accuracy: the held-out check", "trust", "the-held-out-check"),
-    "sensor": ("Units and axes", "units", ""),
-    "response": ("Calibration", "calibration", ""),
     "time": ("Error against run time", "time", ""),
     "plan": ("Light as waves", "diffraction", ""),
     "Depth": ("Your own Mitsuba scene", "worlds", ""),

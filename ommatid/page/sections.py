@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import lru_cache
 from math import sqrt
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,73 +17,37 @@ from ommatid.analysis.next_steps import best_other_type, next_steps
 from ommatid.bench.table import BenchTable
 from ommatid.reconstruct.coarse_model import model_of_f
 from ommatid.reconstruct.output import facts, verdict_words
-from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene
-from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 from . import tables, words
-from .data import ResultMaps, Run, ShownSubImage, maps, read_parts, read_run, shown_sub_image, title_of
+from .data import ResultMaps, Run, ShownSubImage, maps, shown_sub_image
 from .document import fill
-from .panels import error_groups, point_response, resolution, sensor, time_curves
+from .panels import error_groups, resolution, time_curves
 from .panels import maps as result_maps
-from .panels.point_response import IdealMatrix
 
 DRAWN_TABLES = ("target", "camera", "world", "light")  # of the scene file, which the drawing shows
 KEPT_DRAWINGS = 8
-LARGEST = 2_950_000  # bytes of a page
-LARGEST_REDUCTION = 4  # of the number of the sensor's values, to keep a page below LARGEST
 
 
-def page(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None, stamp: str) -> str:
+def page(run: Run, bench: BenchTable | None, stamp: str) -> str:
     """Return the report of a run as HTML.
 
-    ideal : H of one sub-imager as designed, None if not known;  bench : results of `ommatid bench` for the camera
+    bench : results of `ommatid bench` for the camera
     stamp : fingerprint of the content, by which an up-to-date page is recognised
     """
-    content, most = of_run(run, ideal, bench), sensor.MOST_VALUES
-    of_page = {"folder": run.folder, "stamp": stamp}
-    while True:
-        html = fill("page.html", {**content, **of_sensor(run.stack, content["groups"], most), **of_page})
-        if len(html.encode()) <= LARGEST or most <= sensor.MOST_VALUES // LARGEST_REDUCTION:
-            return html
-        most //= 2
-
-
-def page_of(folder: Path) -> str:
-    """Return a page of what a folder holds: a run, or some of stack.exr, model.npz and estimate.exr.
-
-    Raises InputError where there is none of them, or where one is damaged.
-    """
-    from ommatid.simulate.ideal import matrix_as_designed
-
-    parts = read_parts(folder)
-    if {"report", "stack", "model", "estimate", "variance"} <= parts.keys():
-        run = read_run(folder, parts["report"], parts["stack"], parts["model"])
-        return page(run, partial(matrix_as_designed, run.stack.camera), None, run.report.fingerprint)
-    if not {"stack", "model", "estimate"} & parts.keys():
-        raise InputError(f"{folder}: expected stack.exr, model.npz or estimate.exr, got none; run a scene first")
-    return fill("parts_page.html", {**of_parts(folder, parts), "folder": folder, "stamp": ""})
-
-
-def of_run(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None) -> dict[str, Any]:
-    """Return the content of a run's page but for its sensor."""
     truth = None if run.truth is None else run.truth.astype(np.float64)
     single = shown_sub_image(run.stack, truth)
     shown = maps(run.estimate, run.variance, run.truth, single.image, run.others)
     model = model_of_f(run.model, run.stack.camera, PriorTable())
     window = error_window(run.stack, model, run.estimate.astype(np.float64), run.report)
-    images, responses = _images(shown, single, words.numbers_beside(run.report)), _responses(model, ideal)
-    return {
+    content = {
         **_head(run),
-        **images,
+        **_images(shown, single, words.numbers_beside(run.report)),
         **_error(run, window),
         **resolution.content(run, model, window, single),
         **_held_out(run),
-        **responses,
-        "groups": images["groups"] + responses["groups"],
         **_time(run, bench),
         **_camera(run.stack.scene, run.stack.camera),
         "baselines": tables.baselines(run.report) if run.report.baselines else None,
@@ -96,37 +59,7 @@ def of_run(run: Run, ideal: IdealMatrix | None, bench: BenchTable | None) -> dic
         "made": tables.made(run.report),
         "scene_text": tables.scene_text(run.stack.scene),
     }
-
-
-def of_sensor(stack: Stack, groups: list[dict[str, Any]], most: int) -> dict[str, Any]:
-    """Return the sensor's section and the data of all maps; most : number of sensor values."""
-    mosaic = sensor.mosaic(stack, most)
-    return {
-        "mosaic": mosaic,
-        "mosaic_words": sensor.words(mosaic),
-        "document": result_maps.document([*groups, sensor.group(mosaic)]),
-    }
-
-
-def of_parts(folder: Path, parts: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of the page of a folder without a complete run; parts : of one, as `read_parts` has them."""
-    described: Stack | Model | None = parts.get("stack", parts.get("model"))
-    scene = None if described is None else described.scene
-    groups: list[dict[str, Any]] = []
-    content: dict[str, Any] = {"title": title_of(scene, folder), "words": words.contents(parts), "maps": None}
-    content |= {"mosaic": None, "responses": [], "drawing": None, "lenses": None, "scene_text": ""}
-    if "estimate" in parts:
-        content |= _images(maps(parts["estimate"], parts.get("variance"), parts.get("truth")), None, {})
-        groups += content["groups"]
-    if "model" in parts:
-        responses = _responses(parts["model"], None)
-        groups += responses["groups"]
-        content |= responses
-    if described is not None:
-        content |= _camera(described.scene, described.camera)
-        content["scene_text"] = tables.scene_text(described.scene)
-    content["document"] = result_maps.document(groups)
-    return content | of_sensor(parts["stack"], groups, sensor.MOST_VALUES) if "stack" in parts else content
+    return fill("page.html", {**content, "folder": run.folder, "stamp": stamp})
 
 
 def _head(run: Run) -> dict[str, Any]:
@@ -144,17 +77,14 @@ def _head(run: Run) -> dict[str, Any]:
     }
 
 
-def _images(shown: ResultMaps, single: ShownSubImage | None, numbers: dict[str, str]) -> dict[str, Any]:
-    panels = result_maps.panels(shown, "" if single is None else single.title, numbers)
+def _images(shown: ResultMaps, single: ShownSubImage, numbers: dict[str, str]) -> dict[str, Any]:
+    panels = result_maps.panels(shown, single.title, numbers)
     group = result_maps.group("maps", panels, shown.block, (shown.rows, shown.columns))
-    names = [panel.name for panel in panels]
-    pair = next(pair for pair in (("single", "estimate"), ("estimate", "deviation")) if pair[0] in names)
     return {
         "maps": shown,
         "panels": panels,
-        "compared": pair if pair[1] in names else None,
         "ratio": result_maps.ratio(shown.rows, shown.columns),
-        "groups": [group],
+        "document": result_maps.document([group]),
     }
 
 
@@ -190,18 +120,6 @@ def _held_out(run: Run) -> dict[str, Any]:
         "held_out_maps": held_out.lens_type_maps(report),
         "held_out_table": tables.held_out(rows),
     }
-
-
-def _responses(model: Model, ideal: IdealMatrix | None) -> dict[str, Any]:
-    """Return the responses with their panels, and their groups of maps."""
-    responses = point_response.responses(model, ideal)
-    panels = [point_response.panels(response) for response in responses]
-    groups = [
-        result_maps.group(f"response-{response.lens}", shown, 1, response.maps["measured"].shape)
-        for response, shown in zip(responses, panels, strict=True)
-    ]
-    described = [point_response.words(response) for response in responses]
-    return {"responses": list(zip(responses, described, panels, strict=True)), "groups": groups}
 
 
 def _time(run: Run, bench: BenchTable | None) -> dict[str, Any]:
@@ -241,4 +159,4 @@ def _drawn(drawn: DrawnCamera) -> Markup:
     from ommatid.figures.camera_drawing import camera_drawing
     from ommatid.figures.saving import svg_text
 
-    return Markup(svg_text(camera_drawing(drawn.scene, drawn.camera, described=False)))
+    return Markup(svg_text(camera_drawing(drawn.scene, drawn.camera, described=False), "camera-drawing"))

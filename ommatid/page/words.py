@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from math import sqrt
-from typing import Any
 
 from ommatid.reconstruct.output import verdict_words
 from ommatid.reconstruct.output.facts import agreement
@@ -82,15 +80,6 @@ def numbers_beside(report: RunReport) -> dict[str, str]:
         if each.psnr is not None:
             numbers[each.method] = f"{each.psnr:.1f} dB"
     return numbers
-
-
-def contents(parts: Mapping[str, Any]) -> str:
-    """Return what a folder without a complete run holds; parts : of a run, by the fields of `data.Run`."""
-    names = {"a stack": "stack", "a model of H": "model", "an estimate": "estimate"}
-    held = [words for words, name in names.items() if name in parts]
-    missing = [words for words, name in names.items() if name not in parts]
-    words = f"This folder holds {' and '.join(held)}, and no finished run: there is no verdict"
-    return f"{words}. Missing: {', '.join([*missing, 'run.json'])}."
 
 
 def budget(error: ErrorReport) -> list[tuple[str, float, float]]:

@@ -17,7 +17,6 @@ from ommatid.batch.film import cached_film
 from ommatid.batch.frames import Frame, FrameOptions
 from ommatid.batch.remote import SILENT
 from ommatid.page.batch_index import INDEX, cached_index, write_film_index
-from ommatid.page.cached import REPORT
 from ommatid.reconstruct.output import result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture, clear_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
@@ -27,7 +26,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
 from ommatid.runtime.execution.pool import check_options, worker_pool
 from ommatid.runtime.execution.workers import Workers
-from ommatid.runtime.files import file_digest, write_text, write_whole
+from ommatid.runtime.files import file_digest, write_whole
 from ommatid.runtime.input_files import read_text, real_path
 from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_name, check_output
 from ommatid.runtime.outputs.occupied import occupied
@@ -223,8 +222,8 @@ def report_path(path: Path, output: Path | None, progress: Progress, *, baseline
     output : for a stack the folder of its results, None: a folder beside it of its name
     baselines : True compares the estimates with other methods, too
 
-    A stack is reconstructed with model.npz beside it, or without one with H as designed. A folder with nothing but a
-    model or an estimate gets a page of these. Raises InputError if there is nothing to report.
+    A stack is reconstructed with model.npz beside it, or without one with H as designed.
+    Raises InputError if there is nothing to report.
     """
     outcome = _report(path, output, progress)
     if not baselines:
@@ -254,12 +253,6 @@ def _report(path: Path, output: Path | None, progress: Progress) -> ReportOutcom
             return ReportOutcome((path,), None, _design_warnings(path))
         return _report_stack(path / STACK, path, progress)
     folders = tuple(sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file()))
-    if not folders and any((path / name).is_file() for name in (MODEL, result_files.ESTIMATE)):
-        from ommatid.page.sections import page_of
-
-        with occupied(path):
-            write_text(path / REPORT, page_of(path))
-        return ReportOutcome((path,), None, ())
     if not folders:
         raise InputError(f"{path}: expected a stack, or a folder with stack.exr or with folders of runs, got none")
     for folder in folders:

@@ -234,11 +234,9 @@ def earlier_report(folder: Path, fingerprint: str) -> RunReport | None:
 def write_page(results: StageResults, folder: Path, observer: RunObserver) -> None:
     """Write report.html of results unless it is up to date."""
     from ommatid.page.cached import cached_page
-    from ommatid.simulate.ideal import matrix_as_designed
 
     with observer.progress("report"):
-        ideal = partial(matrix_as_designed, results.stack.camera)
-        made = cached_page(folder, results.report, ideal, results.stack, results.model)
+        made = cached_page(folder, results.report, results.stack, results.model)
     observer.done("report", made)
 
 

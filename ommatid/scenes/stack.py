@@ -71,9 +71,9 @@ class Stack:
             return self.recording.noise(self.recording.smoothed_light(self.camera) if light is None else light)
         table, noise = self.scene.noise, dict[str, FloatArray]()
         if table is not None and table.variance > 0:
-            noise["noise"] = np.broadcast_to(np.float64(table.variance), self.values.shape)
+            noise["noise"] = np.full(self.values.size, table.variance)
         if table is not None and table.bits is not None:
-            noise["quantisation"] = np.broadcast_to(np.float64(table.quantisation_variance), self.values.shape)
+            noise["quantisation"] = np.full(self.values.size, table.quantisation_variance)
         return noise
 
     def images(self) -> list[FloatArray]:

@@ -71,16 +71,6 @@ def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     return sparse.csr_array(sparse.vstack(parts, format="csr"))
 
 
-def matrix_as_designed(camera: Camera, sub: SubImager) -> sparse.csr_array:
-    """Return H of one sub-imager, for every kind of lens: (its pixels, N). Raises as `ideal_matrix` does."""
-    lens_type = sub.type
-    if lens_type.optics.distortion is None and not camera.is_blurred(lens_type) and not lens_type.is_rotated:
-        return sub_matrix(camera, sub)
-    size = lens_type.pixels[0] * lens_type.pixels[1]
-    first = (sub.k * lens_type.array[1] + sub.l) * size
-    return ideal_matrix(replace(camera, types=(lens_type,)))[first : first + size]
-
-
 def true_matrix(camera: Camera) -> sparse.csr_array:
     """Return H of all sub-imagers misaligned as the camera's tolerance draws them: (M, N).
 

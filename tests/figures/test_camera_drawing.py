@@ -101,7 +101,7 @@ def test_the_outline_of_the_sensor_is_drawn_around_the_sub_images() -> None:
 def test_svg_for_a_page_takes_the_page_s_colour() -> None:
     scene = read(Path("single"))
     figure = camera_drawing(scene, derive(scene))
-    text = svg_text(figure)
+    text = svg_text(figure, "drawing")
     root = ElementTree.fromstring(text)
     assert root.tag.endswith("svg")
     assert not {"width", "height"} & set(root.attrib)
@@ -109,7 +109,7 @@ def test_svg_for_a_page_takes_the_page_s_colour() -> None:
     assert "#ffffff" not in text
     assert "currentColor" in text
     assert any("break" in (element.text or "") for element in root.iter())
-    assert text == svg_text(figure)
+    assert text == svg_text(figure, "drawing")
 
 
 def test_figures_are_written_in_every_format_and_the_same_again(tmp_path: Path) -> None:

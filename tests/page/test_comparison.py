@@ -113,7 +113,7 @@ def test_baselines_are_in_run_json_and_on_the_page(run: Run, tmp_path: Path, mon
     report = add_baselines(run.folder, no_progress)
     assert [each.method for each in report.baselines] == ["single", "rearranged", "shift_and_add"]
     assert run_json.read(run.folder).baselines == report.baselines
-    text = page(read_run(run.folder), None, None, "0")
+    text = page(read_run(run.folder), None, "0")
     known = known_baselines(run.folder, report.fingerprint)
     assert known is not None
     np.testing.assert_array_equal(maps_of(text)["shift_and_add"], known.images["shift_and_add"])

@@ -28,8 +28,8 @@ from ommatid.analysis.averaging_kernel import ErrorWindow
 from ommatid.bench.table import BenchTable, bench_tables, write
 from ommatid.page import batch_index, data, tables, words
 from ommatid.page.cached import cached_page
-from ommatid.page.panels import error_groups, point_response, sensor, time_curves
-from ommatid.page.sections import page, page_of
+from ommatid.page.panels import error_groups, time_curves
+from ommatid.page.sections import page
 from ommatid.reconstruct.measured_error import best_single_sub_image
 from ommatid.reconstruct.output import facts, run_json
 from ommatid.reconstruct.output.run_json import (
@@ -38,21 +38,15 @@ from ommatid.reconstruct.output.run_json import (
     TimeReport,
     VerdictReport,
 )
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats import exr
-from ommatid.scenes.hardware import frames
-from ommatid.scenes.hardware.frames import AcquisitionSettings
 from ommatid.scenes.scene import parse
-from ommatid.scenes.setup import Setup
-from ommatid.simulate.ideal import ideal_matrix, matrix_as_designed
 
 from ..bench.tables import bench_table, cell, exactly
-from ..examples import familywise, scene
 from ..runs import report_of
 from .runs import F, letter_run, synthetic
 
 VOID = {"meta", "link", "img", "input", "br"}
-SENSOR = {"illuminance": "100 lx", "exposure": "10 ms"}
 
 
 class Reader(HTMLParser):
@@ -123,8 +117,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> data.Run:
 
 
 def html_of(run: data.Run, **changes: Any) -> str:
-    """The page of a run with changes to its report, without ideal H and bench."""
-    return page(replace(run, report=run.report.with_changes(**changes)), None, None, "0")
+    """The page of a run with changes to its report, without bench."""
+    return page(replace(run, report=run.report.with_changes(**changes)), None, "0")
 
 
 # --- self-contained and well-formed
@@ -148,9 +142,9 @@ def test_a_page_is_well_formed_and_says_what_it_is(html: str) -> None:
 
 def test_every_figure_has_a_description_in_words(html: str) -> None:
     drawn = [attributes for tag, attributes in parsed(html).tags if tag in ("canvas", "svg") and "role" in attributes]
-    names = {"truth", "single", "estimate", "error", "deviation", "compare", "packed", "place", "response-I-measured"}
+    names = {"truth", "single", "estimate", "error", "deviation", "compare"}
     assert names <= {attributes.get("data-map") for attributes in drawn}
-    charts = {"chart-transfer", "chart-edge", "chart-spectrum", "chart-errors"}
+    charts = {"chart-transfer", "chart-errors"}
     assert charts <= {attributes.get("id") for attributes in drawn}
     for attributes in drawn:
         assert attributes["role"] == "img"
@@ -173,7 +167,7 @@ def test_markup_in_a_title_is_escaped(finished: Path, tmp_path: Path) -> None:
     title = '</script><script>alert("x")</script> & <b>'
     run = data.read_run(finished)
     run = replace(run, stack=replace(run.stack, scene=run.stack.scene.model_copy(update={"title": title})))
-    text = page(run, None, None, "0")
+    text = page(run, None, "0")
     assert "<script>alert" not in text
     assert parsed(text).text["h1"] == title
     folder = tmp_path / "batch" / "a"
@@ -214,56 +208,22 @@ def test_pictures_share_a_colour_scale(html: str) -> None:
     assert shown["error"]["difference"] == ["estimate", "truth"]
 
 
-def test_a_letter_is_upright_in_the_maps_and_inverted_on_the_sensor(run: data.Run, tmp_path: Path) -> None:
-    text = page(run, None, None, "0")
+def test_a_letter_is_upright_in_the_maps(run: data.Run) -> None:
+    text = page(run, None, "0")
     for name in ("truth", "estimate"):
         np.testing.assert_array_equal(maps_of(text)[name] > 128, F)
-    # `import` cuts recordings of hardware: it recovers the stack from the page's sensor image.
-    mosaic, origin, step = mosaic_of(group_of(text, "sensor"), sensor.mosaic(run.stack))
-    np.save(tmp_path / "mosaic.npy", mosaic)
-    acquisition, setup = AcquisitionSettings(origin=origin), Setup(run.stack.scene, run.stack.camera)
-    recovered, _ = frames.import_stack(setup, [tmp_path / "mosaic.npy"], acquisition)
-    # Half a step of the codes, and float32 rounding of values up to 255.
-    np.testing.assert_allclose(recovered.values, run.stack.values, rtol=0, atol=0.5 * step + 2**-15)
-    upright = replace(acquisition, upright=True)
-    wrong, _ = frames.import_stack(setup, [tmp_path / "mosaic.npy"], upright)
-    assert np.abs(wrong.values - run.stack.values).max() > 50, "the wrong orientation is recognised"
 
 
-def mosaic_of(found: dict[str, Any], shown: sensor.Mosaic) -> tuple[NDArray[np.float64], tuple[int, int], float]:
-    """The sensor image of a page, the position of its first patch, and the step of its values."""
-    low, high = shown.ends
-    step = (high - low) / sensor.LEVELS
-    codes, start = decoded(found["values"]), 0
-    # Patches between whole pixels are placed at the nearest ones, relative to the first patch.
-    places = [patch[-2:] for patch in found["patches"]]
-    corners = [
-        tuple(int(np.floor(place - first + 0.5 + 1e-6)) for place, first in zip(corner, places[0], strict=True))
-        for corner in places
-    ]
-    top, left = min(row for row, _ in corners), min(column for _, column in corners)
-    mosaic = np.zeros((max(row for row, _ in corners) - top + 40, max(column for _, column in corners) - left + 40))
-    for (_, _, _, rows, across, *_), (row, column) in zip(found["patches"], corners, strict=True):
-        values = low + step * codes[start : start + rows * across].reshape(rows, across)
-        mosaic[row - top : row - top + rows, column - left : column - left + across] = values
-        start += rows * across
-    return mosaic, (-top, -left), step
-
-
-def test_dead_pixels_are_marked_and_counted(tmp_path: Path) -> None:
-    text = page(letter_run(tmp_path, dead=5), None, None, "0")
-    codes = decoded(group_of(text, "sensor")["values"])
-    assert np.sum(codes == sensor.MISSING) == 5
-    assert "5 sensor pixels are dead" in text
-    assert "5 dead sensor pixels are excluded" in text
+def test_dead_pixels_are_counted(tmp_path: Path) -> None:
+    assert "5 dead sensor pixels are excluded" in page(letter_run(tmp_path, dead=5), None, "0")
 
 
 def test_without_the_truth_a_page_has_no_comparison(tmp_path: Path) -> None:
-    text = page(letter_run(tmp_path, truth=False), None, None, "0")
+    text = page(letter_run(tmp_path, truth=False), None, "0")
     assert set(maps_of(text)) == {"single", "estimate", "deviation"}
     assert "The truth is not known" in text
     assert "Best single sub-image" not in text
-    for absent in ("chart-errors", "chart-spectrum", 'data-map="truth"', 'data-map="error"', " dB"):
+    for absent in ("chart-errors", 'data-map="truth"', 'data-map="error"', " dB"):
         assert absent not in text
     assert "chart-transfer" in text
 
@@ -271,7 +231,7 @@ def test_without_the_truth_a_page_has_no_comparison(tmp_path: Path) -> None:
 @pytest.mark.parametrize("shape", [(200, 600), pytest.param((512, 512), marks=pytest.mark.slow)])
 def test_a_large_frame_is_reduced_to_means_and_fits(shape: tuple[int, int], run: data.Run) -> None:
     frame = synthetic(run, shape)
-    text = page(frame, None, None, "0")
+    text = page(frame, None, "0")
     assert len(text.encode()) < 3_000_000
     estimate = maps_of(text)["estimate"]
     block = group_of(text, "maps")["block"]
@@ -319,7 +279,7 @@ def test_a_page_shows_the_run_time_and_the_effect_of_more_samples(run: data.Run)
     assert "chose render.samples = 700, calibration.samples = auto." in text
 
 
-# --- error groups, point-spread functions, error against time
+# --- error groups, error against time
 
 
 def with_errors(seed: int, deviation: NDArray[np.float64], predicted: NDArray[np.float64], run: data.Run) -> data.Run:
@@ -370,15 +330,14 @@ def test_what_a_trusting_estimator_alone_has_is_left_out_of_others(run: data.Run
     plain["camera"]["tolerance"] = {"position": "400 nm"}
     stack = replace(run.stack, scene=parse(plain, run.stack.scene.source))
     text = html_of(replace(run, stack=stack), verdict=VerdictReport(trusted=True, reasons=()))
-    plots = ("Modulation transfer function", "Response to an edge", '"col">99 % interval', "nother lens type, of")
+    plots = ("Modulation transfer function", '"col">99 % interval', "nother lens type, of")
     reader = parsed(text)
     assert (reader.open, reader.mismatched) == ([], [])
     assert text.count("not computed for <code>estimator.misalignment = &#39;fit&#39;</code>") == 1
     assert [words for words in plots if words in text] == []
-    assert "Radial spectrum of the error" in text
     assert "groups without intervals" in text
     trusting = html_of(run)
-    assert all(words in trusting for words in plots[:3])
+    assert all(words in trusting for words in plots[:2])
     assert "not computed for <code>estimator" not in trusting
 
 
@@ -394,48 +353,6 @@ def test_pixels_of_equal_deviation_are_one_group(run: data.Run) -> None:
     assert not wrong.is_inside
 
 
-def test_point_spread_functions_are_columns_of_h(finished: Path) -> None:
-    run = data.read_run(finished)
-    camera, model = run.stack.camera, run.model
-    [response] = point_response.responses(model, lambda sub: matrix_as_designed(camera, sub))
-    sub, maps = camera.sub_imagers[4], response.maps
-    assert (response.lens, response.k, response.l) == ("I", sub.k, sub.l)
-    rows, column = camera.slices()[4], response.source[0] * camera.columns + response.source[1]
-    (top, left), (height, width) = response.corner, maps["measured"].shape
-    shown = np.s_[top : top + height, left : left + width]
-    measured = model.matrix.toarray()[rows, column].reshape(3, 3)
-    ideal = ideal_matrix(camera).toarray()[rows, column].reshape(3, 3)
-    assert measured.any()
-    np.testing.assert_array_equal(maps["measured"], measured[shown])
-    np.testing.assert_allclose(maps["ideal"], ideal[shown], rtol=1e-14)
-    scores = maps["difference"]
-    known = np.isfinite(scores) & (scores != 0)
-    assert np.abs(scores[known]).max() < stats.t.isf(familywise(known.sum()) / 2, 15)
-
-
-@pytest.mark.parametrize("glass", [{}, {"aperture": "0.4 mm", "focus": "600 mm"}])
-def test_h_of_one_sub_imager_is_its_part_of_the_whole(glass: dict[str, Any]) -> None:
-    plain = scene((14, 14), (("1/3", [2, 2], [3, 3]), ("1/2", [2, 3], [4, 4]))).plain()
-    plain["camera"]["lens"][1] |= glass
-    camera = derive(parse(plain, Path("test.toml")))
-    whole = ideal_matrix(camera)
-    for sub, rows in zip(camera.sub_imagers, camera.slices(), strict=True):
-        part = matrix_as_designed(camera, sub)
-        np.testing.assert_allclose(part.toarray(), whole[rows].toarray(), rtol=1e-12, atol=1e-15)
-
-
-def test_an_ideal_h_is_shown_without_a_comparison(run: data.Run) -> None:
-    text = page(run, lambda sub: matrix_as_designed(run.stack.camera, sub), None, "0")
-    assert "H is the ideal one, so there is nothing to compare it with" in text
-    assert "Calibrated" not in text
-    assert 'data-map="response-A-measured"' in text
-    assert 'data-map="response-A-ideal"' not in text
-    stored = point_response.responses(run.model, None)
-    boxes = point_response.responses(replace(run.model, stored=None), None)
-    for one, other in zip(stored, boxes, strict=True):
-        np.testing.assert_allclose(one.maps["measured"], other.maps["measured"], rtol=1e-14)
-
-
 def bench(camera: Camera) -> BenchTable:
     """A bench table with three renderings, an estimate, and a calibration without a known error."""
     cells = [cell(samples=n, seconds=exactly(0.1 * n), mse=exactly(1 / n)) for n in (1, 2, 4)]
@@ -447,12 +364,11 @@ def bench(camera: Camera) -> BenchTable:
 def test_a_bench_of_the_same_camera_is_drawn(run: data.Run) -> None:
     assert "there are no results for this camera" in html_of(run)
     table = bench(run.stack.camera)
-    text = page(run, None, table, "0")
+    text = page(run, table, "0")
     assert 'id="chart-effort"' in text
     assert "Recommendation of the bench: four samples reach the noise floor." in text
-    figure, words = time_curves.time_curves(run, table)
+    _, words = time_curves.time_curves(run, table)
     assert all(f"The {stage} stage took" in words for stage in ("render", "reconstruct"))
-    assert figure.count("<title>") == 4 + 2, "a cell without a known error is not drawn"
 
 
 def test_a_bench_serves_the_same_camera_in_the_folder_or_its_parent(run: data.Run, tmp_path: Path) -> None:
@@ -514,24 +430,6 @@ def test_without_trust_the_sentence_says_that_the_numbers_are_of_little_use() ->
     assert "resolve this first" in words.sentence(wrong)
 
 
-# --- folders without a complete run
-
-
-def test_a_page_of_a_folder_shows_what_is_there(finished: Path, tmp_path: Path) -> None:
-    for number, held in enumerate((("stack.exr",), ("model.npz",), ("estimate.exr",), ("stack.exr", "model.npz"))):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        for name in held:
-            shutil.copy(finished / name, folder)
-        text = page_of(folder)
-        reader = parsed(text)
-        assert (reader.open, reader.mismatched) == ([], [])
-        assert ('data-map="packed"' in text) == ("stack.exr" in held)
-        assert ('data-map="response-I-measured"' in text) == ("model.npz" in held)
-        assert ('data-map="estimate"' in text) == ("estimate.exr" in held)
-        assert "no finished run: there is no verdict" in text
-
-
 def test_next_steps_are_those_of_a_trusted_run(run: data.Run) -> None:
     text = html_of(run, verdict=VerdictReport(trusted=True, reasons=()))
     assert "null space of H, 97 % of the predicted MSE; neither samples nor less noise reduce it" in text, (
@@ -553,7 +451,7 @@ def test_next_steps_are_those_of_a_trusted_run(run: data.Run) -> None:
 
 def written(folder: Path) -> bool:
     """Return True if the page of a finished run had to be written."""
-    return cached_page(folder, run_json.read(folder), None)
+    return cached_page(folder, run_json.read(folder))
 
 
 def test_a_page_is_rewritten_only_if_its_content_changes(finished: Path, tmp_path: Path) -> None:
@@ -586,7 +484,7 @@ def test_an_index_lists_results_and_failures(finished: Path, tmp_path: Path) -> 
     error = data.read_run(finished).report.error
     for value in (error.mse, error.predicted_mse):
         assert f'<td data-value="{value}">{value:.4g}</td>' in text
-    assert text.count(f"measured {error.mse:.4g}</title>") == 3
+    assert 'id="chart-scenes"' in text
     area = run_area(finished)
     assert f">{data.read_run(finished).report.measurements}</td>" in text
     assert f">{area:.3g}</td>" in text

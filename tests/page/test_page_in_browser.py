@@ -17,10 +17,8 @@ from skimage import io
 from ommatid.page.batch_index import BatchEntry
 from ommatid.page.batch_index import page as index_of
 from ommatid.page.data import Run
-from ommatid.page.panels import sensor
 from ommatid.page.sections import page as page_of
 from ommatid.runtime.arrays import FloatArray
-from ommatid.simulate.ideal import matrix_as_designed
 
 from .runs import F, letter_run
 
@@ -57,7 +55,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 def letter(run: Run) -> Path:
     """The page of this run."""
     path = run.folder / "report.html"
-    path.write_text(page_of(run, lambda sub: matrix_as_designed(run.stack.camera, sub), None, "0"), encoding="utf-8")
+    path.write_text(page_of(run, None, "0"), encoding="utf-8")
     return path
 
 
@@ -200,8 +198,7 @@ def test_a_dark_colour_scheme_darkens_page_and_charts_but_not_maps(letter: Path,
     def look(page: Page) -> list[str]:
         return page.evaluate("""() => [
             getComputedStyle(document.body).backgroundColor,
-            getComputedStyle(document.querySelector("#chart-transfer .tick")).fill,
-            getComputedStyle(document.querySelector("#chart-transfer .line")).stroke,
+            getComputedStyle(document.querySelector("#chart-transfer text")).fill,
             getComputedStyle(document.querySelector(".camera-drawing svg")).fill,
         ]""")
 
@@ -360,23 +357,6 @@ def test_images_are_saved_as_arrays_tables_and_pictures(letter: Path, run: Run, 
                     assert io.imread(path).shape[:2] == (24, 24)
 
 
-@pytest.mark.slow
-def test_the_pointer_identifies_sub_images(letter: Path, run: Run, shown: Opened) -> None:
-    patch = sensor.mosaic(run.stack).patches[1]
-    with shown(letter) as page:
-        page.locator("#sensor summary").click()
-        row, column = patch.packed
-        page.mouse.move(*position(page, "packed", row + 1.5, column + 2.5, "packed"))
-        read = page.locator('.read[data-group="packed"]').inner_text()
-        where, value = read.split(": ")
-        assert where == f"lens type A, sub-imager {patch.k}, {patch.l}, row 1, column 2"
-        inverted = run.stack.images()[1][::-1, ::-1]
-        # Rounded to 1/65534 of a range below 255, and shown with five digits.
-        assert float(value) == pytest.approx(inverted[1, 2], abs=0.5 * 255 / 65534 + 0.005)
-        page.mouse.move(2, 2)
-        assert not page.locator('.read[data-group="packed"]').inner_text().strip()
-
-
 # --- print
 
 
@@ -389,7 +369,7 @@ def test_print_is_light_and_without_tools(dark: bool, letter: Path, shown: Opene
         for selector in (".tools", ".pixel", "#divider"):
             assert not any(element.is_visible() for element in page.locator(selector).all()), selector
         assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-        ink = page.evaluate("getComputedStyle(document.querySelector('#chart-transfer .tick')).fill")
+        ink = page.evaluate("getComputedStyle(document.querySelector('#chart-transfer text')).fill")
         assert max(int(part) for part in re.findall(r"\d+", ink)[:3]) < 128
         assert canvas(page, "estimate").is_visible()
         assert len(page.pdf(format="A4")) > 50_000

@@ -90,16 +90,6 @@ def test_report_writes_the_page_of_a_run_of_a_batch_and_of_a_stack(kept: Path, h
     assert "expected a stack, or a folder" in nothing.err
 
 
-def test_report_writes_the_page_of_an_estimate_alone(finished: Path, here: Path, ommatid: Command) -> None:
-    (here / "alone").mkdir()
-    shutil.copy(finished / "estimate.exr", here / "alone")
-    ended = ommatid("report", "alone")
-    assert ended.code == 0
-    text = (here / "alone" / "report.html").read_text(encoding="utf-8")
-    assert 'data-map="estimate"' in text
-    assert "Missing: a stack, a model of H, run.json." in text
-
-
 def test_the_estimate_alone_and_other_names(finished: Path, here: Path, ommatid: Command) -> None:
     files = finished / "stack.exr", finished / "model.npz"
     ended = ommatid("reconstruct", *files, "-o", "alone.exr", "--region", "2,2,3,3", "-v")

@@ -17,7 +17,7 @@ from ommatid.scenes.hardware.point_sources import unrecorded
 from ommatid.scenes.scene import Scene, parse, read, write
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.ideal import ideal_matrix, ideal_model, matrix_as_designed
+from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import light
 from ommatid.simulate.sampling.passes import rounding_variance
 
@@ -86,8 +86,6 @@ def test_h_is_that_of_counted_cells() -> None:
     assert set(inside) == set(np.flatnonzero(counted[:, outside.ravel()].sum(axis=1) == 0))
     columns = counted[inside].reshape(-1, *camera.shape)[:, part[0], part[1]].reshape(inside.size, -1)
     np.testing.assert_allclose(boxes.submatrix(*part).toarray(), columns, atol=1e-14)
-    for sub, rows in zip(camera.sub_imagers, camera.slices(), strict=True):
-        np.testing.assert_allclose(matrix_as_designed(camera, sub).toarray(), counted[rows], atol=1e-14)
 
 
 def test_pixels_seen_are_those_of_the_windows() -> None:

@@ -94,7 +94,6 @@ def figure(groups: list[ErrorGroup]) -> Markup:
         "dots",
         low=[low for low, _ in intervals],
         high=[high for _, high in intervals],
-        tips=[f"{group.pixels} pixels: predicted {group.predicted:.4g}, {group.measured:.4g}" for group in groups],
     )
     equal = ChartSeries("measured equals predicted", ends, ends, "dashed", 0)
     x, y = (ChartAxis(f"{name} RMS error of a pixel", logarithmic) for name in ("predicted", "measured"))

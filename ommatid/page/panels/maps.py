@@ -81,7 +81,7 @@ class Panel:
         return self.title.partition(" (")[0]
 
 
-def panels(maps: ResultMaps, single: str = "", numbers: dict[str, str] | None = None) -> list[Panel]:
+def panels(maps: ResultMaps, single: str, numbers: dict[str, str] | None = None) -> list[Panel]:
     """Return the panels in order; those that need the truth only if it is known.
 
     single : title of the sub-image;  numbers : figures beside the titles, by name
@@ -103,10 +103,9 @@ def panels(maps: ResultMaps, single: str = "", numbers: dict[str, str] | None = 
         shown.append(
             Panel("error", "Error", maps.error, colours, beside.get("error", ""), words, ("estimate", "truth"))
         )
-    if maps.deviation is not None:
-        colours = ColourScale("sequential", 0.0, largest([maps.deviation]), "posterior standard deviation")
-        words = value_words(maps.deviation)
-        shown.append(Panel("deviation", "Error bar", maps.deviation, colours, beside.get("deviation", ""), words))
+    colours = ColourScale("sequential", 0.0, largest([maps.deviation]), "posterior standard deviation")
+    words = value_words(maps.deviation)
+    shown.append(Panel("deviation", "Error bar", maps.deviation, colours, beside.get("deviation", ""), words))
     for name, picture in maps.others.items():
         shown.append(Panel(name, _title(name), picture, grey, beside.get(name, ""), value_words(picture)))
     return shown

@@ -13,7 +13,7 @@ from ommatid.bench.table import BenchTable, Cell
 from ..data import Run
 from .charts import ChartAxis, ChartSeries, chart
 
-COLOURS = {"render": 2, "calibrate": 3, "reconstruct": 4}
+COLOURS = {"render": 1, "calibrate": 2, "reconstruct": 3}
 
 
 @dataclass(frozen=True)
@@ -56,18 +56,14 @@ def _figure(measured: Sequence[TimePoint], run: Sequence[TimePoint], said: str) 
         front = pareto_front(points, lambda point: point.seconds, lambda point: point.mse)
         own = [point for point in run if point.stage == stage]
         series.append(ChartSeries("", *_columns(front), "line", colour))
-        series.append(ChartSeries(stage, *_columns(points), "dots", colour, tips=_tips(points)))
-        series.append(ChartSeries("", *_columns(own), "stars", colour, tips=_tips(own)))
+        series.append(ChartSeries(stage, *_columns(points), "dots", colour))
+        series.append(ChartSeries("", *_columns(own), "rings", colour))
     axes = ChartAxis("time of the stage (s)", True), ChartAxis("mean squared error", True)
     return chart("effort", *axes, series, said)
 
 
 def _columns(points: Sequence[TimePoint]) -> tuple[list[float], list[float]]:
     return [point.seconds for point in points], [point.mse for point in points]
-
-
-def _tips(points: Sequence[TimePoint]) -> list[str]:
-    return [f"{point.stage}, {point.setting}: {point.mse:.4g} in {point.seconds:.3g} s" for point in points]
 
 
 def _words(measured: Sequence[TimePoint], run: Sequence[TimePoint], advice: str) -> str:

@@ -2,7 +2,7 @@
 // Draws the maps of a page on canvases, and connects them: zoom, pointer, comparison, values and files to save.
 (async () => {
   const content = JSON.parse(document.getElementById("figures").textContent);
-  const TYPES = { float32: Float32Array, uint16: Uint16Array };
+  const TYPES = { float32: Float32Array };
   const LARGEST_ZOOM = 64; // screen pixels of a pixel of the image, about
   const NEAR = 14; // screen pixels from the line between two images, in which it is caught
 
@@ -23,8 +23,8 @@
   }
   const missing = [1, 3, 5].map((at) => parseInt(content.missing.slice(at, at + 2), 16));
 
-  // A picture of values with the colours of a scale; `isMissing` marks pixels without a value.
-  function raster(values, columns, rows, { palette, low, high }, isMissing = Number.isNaN) {
+  // A picture of values with the colours of a scale; NaN marks pixels without a value.
+  function raster(values, columns, rows, { palette, low, high }) {
     const canvas = document.createElement("canvas");
     [canvas.width, canvas.height] = [columns, rows];
     const context = canvas.getContext("2d");
@@ -32,7 +32,7 @@
     const table = colours(palette);
     for (let index = 0; index < values.length; index++) {
       const at = 4 * index;
-      if (isMissing(values[index])) {
+      if (Number.isNaN(values[index])) {
         picture.data.set([...missing, 255], at);
       } else {
         const share = (values[index] - low) / (high - low);
@@ -286,48 +286,7 @@
     URL.revokeObjectURL(link.href);
   }
 
-  // --- sensor
-
-  async function addSensor(group) {
-    const { values } = await decode(group.values);
-    let start = 0;
-    const patches = group.patches.map(([lens, k, l, rows, columns, packedRow, packedColumn, placeRow, placeColumn]) => {
-      const codes = values.subarray(start, start + rows * columns);
-      start += rows * columns;
-      const scale = { palette: "grey", low: 0, high: group.missing - 1 };
-      const picture = raster(codes, columns, rows, scale, (code) => code === group.missing);
-      return { lens, k, l, rows, columns, codes, picture, packed: [packedRow, packedColumn], place: [placeRow, placeColumn] };
-    });
-    for (const [name, [left, right, top, bottom]] of Object.entries(group.views)) {
-      const view = new View(name, left, top, right - left, bottom - top);
-      views.set(name, view);
-      for (const canvas of document.querySelectorAll(`canvas[data-group="${name}"]`)) {
-        canvas.paint = (context) => {
-          for (const patch of patches) {
-            const [row, column] = patch[name];
-            context.drawImage(patch.picture, column, row, patch.columns * group.block, patch.rows * group.block);
-          }
-        };
-        view.canvases.push(canvas);
-        connect(canvas, view);
-      }
-      const output = document.querySelector(`.read[data-group="${name}"]`);
-      view.changed.push(() => {
-        const inside = (patch) => {
-          const [i, j] = [1, 0].map((axis, index) => Math.floor((view.pointer[axis] - patch[name][index]) / group.block));
-          return i >= 0 && j >= 0 && i < patch.rows && j < patch.columns ? [i, j] : null;
-        };
-        const patch = view.pointer ? patches.find(inside) : null;
-        if (!patch) { output.textContent = "\u00a0"; return; }
-        const [i, j] = inside(patch);
-        const code = patch.codes[i * patch.columns + j];
-        const value = code === group.missing ? "none (dead pixel)" : (group.scale.low + group.step * code).toPrecision(5);
-        output.textContent = `lens type ${patch.lens}, sub-imager ${patch.k}, ${patch.l}, row ${i * group.block}, column ${j * group.block}: ${value}`;
-      });
-    }
-  }
-
-  for (const group of content.groups) await (group.name === "sensor" ? addSensor(group) : addMaps(group));
+  for (const group of content.groups) await addMaps(group);
   const drawAll = () => { for (const view of views.values()) view.draw(); };
   for (const bar of document.querySelectorAll(".tools")) {
     bar.addEventListener("click", (event) => {
@@ -340,11 +299,6 @@
   }
   const pixel = document.querySelector("form.pixel");
   if (pixel) connectPixel(pixel);
-  const lens = document.getElementById("lens");
-  lens?.addEventListener("change", () => {
-    for (const response of document.querySelectorAll(".response")) response.hidden = response.dataset.lens !== lens.value;
-    drawAll();
-  });
   for (const fold of document.querySelectorAll("details")) fold.addEventListener("toggle", drawAll);
   addEventListener("resize", drawAll);
   addEventListener("hashchange", () => document.querySelector(`details${location.hash}`)?.setAttribute("open", ""));

@@ -273,7 +273,7 @@ def leaves(document: Any, prefix: str = "") -> Iterator[str]:
 DOCUMENTED_AS_ONE = (  # keys whose contents are not listed one by one
     *("versions", "model.fit.parameters", "model.fit.units", "depth.rms_disparity_by_type"),
     *("model.fit.structure", "model.fit.chances", "model.fit.chart", "model.fit.kernels"),
-    *("stages.render.not_reached", "stages.calibrate.auto", "spent.stages", "spent.chosen"),
+    *("stages.render.not_reached", "stages.calibrate.auto", "spent.chosen"),
 )
 
 

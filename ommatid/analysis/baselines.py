@@ -128,22 +128,23 @@ def baselines(stack: Stack, model: Model, truth: FloatArray, progress: Progress 
     truth = truth.reshape(shape)
     reports, images = list[MethodReport](), dict[str, Float32Array]()
 
-    def add(method: BaselineMethod, image: FloatArray, seconds: float, weight: float | None = None) -> None:
+    def add(method: BaselineMethod, image: FloatArray, seconds: float, **chosen: Any) -> None:
         error = measure_error(image.ravel(), truth.ravel(), shape)
         numbers = {"mse": error.mse, "psnr": error.psnr, "ssim": error.ssim, "seconds": seconds}
-        reports.append(MethodReport(method=method, **numbers, **({} if weight is None else {"weight": weight})))
+        reports.append(MethodReport(method=method, **numbers, **chosen))
         images[method] = image.astype(np.float32)
 
     begun = perf_counter()
     single = best_single_sub_image(stack, truth)
     if single is not None:
-        add("single", single.image, perf_counter() - begun)
+        add("single", single.image, perf_counter() - begun, sub_imager=single.name)
     begun = perf_counter()
     add("rearranged", rearranged(stack), perf_counter() - begun)
     begun = perf_counter()
     add("shift_and_add", shift_and_add(stack), perf_counter() - begun)
     if not missing_methods(truth.size):
-        add("total_variation", *tuned_total_variation(stack, model, truth, progress))
+        image, seconds, weight = tuned_total_variation(stack, model, truth, progress)
+        add("total_variation", image, seconds, weight=weight)
     return Baselines(tuple(reports), images)
 
 

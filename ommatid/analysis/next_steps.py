@@ -52,7 +52,7 @@ def next_steps(report: RunReport, other: AnotherType | None = None) -> list[Next
     now, budget = report.error.predicted_mse, report.error.budget
     if not is_trusted(report) or now <= 0:
         return []
-    steps = [_samples(report)] if report.spent.more and follows_samples(report) else []
+    steps = [_samples(report)] if report.more_samples and follows_samples(report) else []
     for name, (words, how, factor) in CHANGES.items():
         part = budget.get(name, 0.0)
         steps.append(NextStep(words, how, now - (1 - factor) * part, is_bound=True))
@@ -71,7 +71,7 @@ def _with_other_type(report: RunReport, other: AnotherType) -> float:
 
 
 def _samples(report: RunReport) -> NextStep | None:
-    more = next((more for more in report.spent.more if more.times == TIMES), report.spent.more[-1])
+    more = next(more for more in report.more_samples if more.times == TIMES)
     parts = {name: report.error.budget.get(name, 0.0) for name in SAMPLES}
     keys = " and ".join(key for name, key in SAMPLES.items() if parts[name])
     if not keys:

@@ -39,7 +39,7 @@ def predict(
     From Eq. 5, and a few rays where they matter: no picture is rendered.
     """
     from ommatid.pipeline import stages
-    from ommatid.pipeline.batches import batch_members, batch_warnings, run_batch, scene_batch
+    from ommatid.pipeline.batches import Batch, BatchFiles, batch_members, batch_warnings, run_batch
     from ommatid.pipeline.sections import predicted_lines, predicted_sections
 
     if folder is not None and not sweep:
@@ -49,11 +49,9 @@ def predict(
     output.warn_all(batch_warnings(members))
     with output.batch_bars(len(members), printing.quiet) as bars:
         predicted = partial(stages.predict_scene, rays=not no_rays)
-        batch = scene_batch(predicted, bars.observer, lambda _, description: description)
-        outcome = run_batch(
-            batch, members, failures.report, progress=bars.progress,
-            sweep_folder=folder, with_folders=False, figures=figures,
-        )  # fmt: skip
+        batch = Batch(predicted, bars.observer, lambda _, description: description)
+        files = BatchFiles(folder, None, figures)
+        outcome = run_batch(batch, members, failures.report, progress=bars.progress, files=files, with_folders=False)
     sections = predicted_sections(members, outcome, detail)
     if detail == "verdict":
         output.print_lines(predicted_lines(outcome.documents))

@@ -46,9 +46,8 @@ def run(
     strict: Strict = False,
 ) -> None:
     """Render, calibrate, reconstruct and report."""
-    from ommatid.batch.batch import with_options
     from ommatid.pipeline import stages
-    from ommatid.pipeline.batches import batch_members, batch_warnings, run_batch, scene_batch, share_of_job
+    from ommatid.pipeline.batches import Batch, BatchFiles, batch_members, batch_warnings, run_batch, share_of_job
     from ommatid.pipeline.time_budget import check_within, stages_within
 
     detail, (others, figures) = printing.detail, options.formats(formats)
@@ -62,15 +61,11 @@ def run(
         time = options.seconds(within)
         work = stages_within(time, members, STARTED, output.warn, jobs.scheduler, workers)
         check, workers = check_within, 1
-    work = stages.with_baselines(work) if baselines else work
-    work = with_options(stages.with_figures(work, figures), check if force else None, others)
-    table = None if jobs.job else folder
+    work = stages.SceneWork(work, check if force else None, others, figures, baselines)
+    files = BatchFiles(None if jobs.job else folder, folder, figures)
     with output.batch_bars(len(members), printing.quiet) as bars:
-        batch = scene_batch(work, bars.observer, partial(_print_run, detail, bars))
-        outcome = run_batch(
-            batch, members, failures.report, cluster, workers, bars.progress,
-            sweep_folder=table, index_folder=folder, figures=figures,
-        )  # fmt: skip
+        batch = Batch(work, bars.observer, partial(_print_run, detail, bars))
+        outcome = run_batch(batch, members, failures.report, cluster, workers, bars.progress, files=files)
     failures.finish_batch(outcome, printing.as_json, strict, words)
 
 
@@ -116,17 +111,16 @@ def render(
     as_json: Json = False,
 ) -> None:
     """Render the sub-images alone."""
-    from ommatid.batch.batch import with_options
     from ommatid.pipeline import stages
-    from ommatid.pipeline.batches import batch_members, batch_warnings, run_batch, scene_batch, share_of_job
+    from ommatid.pipeline.batches import Batch, BatchFiles, batch_members, batch_warnings, run_batch, share_of_job
 
     def report(member: Member, description: dict[str, Any]) -> dict[str, Any]:
         return {"file": str(member.folder / "stack.exr"), **description}
 
     members, words = share_of_job(jobs.job, batch_members(scenes, folder, sweep, *changes.both), jobs.scheduler)
     output.warn_all(batch_warnings(members))
-    check, table = stages.check_render if force else None, None if jobs.job else folder
+    check, files = stages.check_render if force else None, BatchFiles(None if jobs.job else folder)
     with output.batch_bars(len(members)) as bars:
-        batch = scene_batch(with_options(stages.render, check, ()), bars.observer, report)
-        outcome = run_batch(batch, members, failures.report, *jobs.pool, bars.progress, sweep_folder=table)
+        batch = Batch(stages.SceneWork(stages.render, check), bars.observer, report)
+        outcome = run_batch(batch, members, failures.report, *jobs.pool, bars.progress, files=files)
     failures.finish_batch(outcome, as_json, job_words=words)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,7 @@ class BatchEntry:
     """Results of one scene of a batch, or the reason of its failure.
 
     sensor_area : of all recorded pixels, mm^2; None if it is not known
-    page, picture : addresses, relative to the index
+    page, picture : addresses, relative to the index;  values : of the varied keys of a sweep
     """
 
     name: str
@@ -66,6 +66,7 @@ class BatchEntry:
     sensor_area: float | None = None
     page: str = ""
     picture: str = ""
+    values: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     @property
     def title(self) -> str:
@@ -95,7 +96,7 @@ class BatchEntry:
     @property
     def seconds(self) -> float:
         """Run time of all stages."""
-        return sum(stage.seconds for stage in self.report.stages.values()) if self.report else 0.0
+        return self.report.seconds if self.report else 0.0
 
 
 def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
@@ -108,15 +109,18 @@ def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
         return False
     check_index(output)
     others = sorted(path.parent for path in output.glob(f"*/{REPORT}") if path.parent not in folders)
-    entries = [_entry(folder, folders.get(folder, "")) for folder in (*folders, *others)]
-    sweep, picture = read_sweep(output / NUMBERS), output / SWEEP_PICTURE
-    described = [
-        [entry.name, entry.failure, entry.sensor_area, entry.report and entry.report.plain()] for entry in entries
+    values = {Path(row.folder or "").name: row.values for row in read_sweep(output / NUMBERS)}
+    entries = [
+        replace(_entry(folder, folders.get(folder, "")), values=values.get(folder.name, {}))
+        for folder in (*folders, *others)
     ]
-    drawn = SWEEP_PICTURE if picture.is_file() else ""
-    stamp = fingerprint([described, [row.flat() for row in sweep], drawn, sources_digest()])
-    name = real_path(output).name
-    content: dict[str, Any] = {"sweep": sweep, "sweep_picture": drawn, "title": f"Batch: {name}"}
+    described = [
+        [entry.name, entry.failure, entry.sensor_area, entry.report and entry.report.plain(), entry.values]
+        for entry in entries
+    ]
+    drawn = SWEEP_PICTURE if (output / SWEEP_PICTURE).is_file() else ""
+    stamp = fingerprint([described, drawn, sources_digest()])
+    content: dict[str, Any] = {"sweep_picture": drawn, "title": f"Batch: {real_path(output).name}"}
     return cached(output / INDEX, stamp, read_stamp, lambda: page(entries, stamp, **content), write_text)[1]
 
 
@@ -176,25 +180,22 @@ def read_sweep(path: Path) -> list[SweepRow]:
         return []
 
 
-def page(
-    entries: list[BatchEntry], stamp: str, sweep: Sequence[SweepRow] = (), noun: str = "scenes", **content: Any
-) -> str:
+def page(entries: list[BatchEntry], stamp: str, noun: str = "scenes", **content: Any) -> str:
     """Return the index as HTML; without figures if there is nothing to compare.
 
     noun : what the entries are;  content : its `title`; `sweep_picture`, file of the figure of the sweep; `film`
     """
     from .document import fill
 
-    of_sweep = {"sweep": sweep, "sweep_keys": list(dict.fromkeys(key for row in sweep for key in row.values))}
     of_batch = {
         "entries": entries,
+        "keys": list(dict.fromkeys(key for entry in entries for key in entry.values)),
         "columns": COLUMNS,
         "words": words(entries, noun),
         "figure": _scenes_figure(entries),
     }
-    of_page = {"url": url, "page_file": REPORT, "noun": noun, "document": "", "stamp": stamp}
-    empty: dict[str, Any] = {"film": None, "sweep_picture": ""}
-    return fill("index.html", {**empty, **of_sweep, **of_batch, **of_page, **content}, "index.js")
+    of_page: dict[str, Any] = {"noun": noun, "document": "", "stamp": stamp, "film": None, "sweep_picture": ""}
+    return fill("index.html", {**of_page, **of_batch, **content}, "index.js")
 
 
 def words(entries: list[BatchEntry], noun: str = "scenes") -> str:

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 from ommatid.bench.table import bench_tables
-from ommatid.reconstruct.output.run_json import RunReport, of_stages
+from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.input_files import open_input
 from ommatid.scenes import stack
@@ -32,7 +32,7 @@ def cached_page(
     recorded, calibrated : the stack and the model in the folder, None to read them
     Raises InputError for missing or damaged files, MachineError for a full disk.
     """
-    report = of_stages(report)
+    report = report.of_stages()
     recorded = stack.read(folder / "stack.exr") if recorded is None else recorded
     bench = next(bench_tables(folder, recorded.camera.describe()), None)
     described = None if bench is None else bench.describe()

@@ -104,7 +104,7 @@ def read_run(
 
 def _others(folder: Path, report: RunReport) -> Mapping[str, Float32Array]:
     """Return the images of the baselines beside the single sub-image, which the page draws in any case."""
-    known = known_baselines(folder, report.fingerprint) if report.baselines else None
+    known = known_baselines(folder, report.fingerprint) if len(report.baselines) > 1 else None
     return {} if known is None else {name: image for name, image in known.images.items() if name != "single"}
 
 

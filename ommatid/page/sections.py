@@ -50,7 +50,7 @@ def page(run: Run, bench: BenchTable | None, stamp: str) -> str:
         **_held_out(run),
         **_time(run, bench),
         **_camera(run.stack.scene, run.stack.camera),
-        "baselines": tables.baselines(run.report) if run.report.baselines else None,
+        "baselines": tables.baselines(run.report) if len(run.report.baselines) > 1 else None,
         "baseline_words": facts.baseline_words(run.report),
         "skipped": tables.skipped(run),
         "numbers": tables.numbers(run),

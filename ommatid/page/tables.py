@@ -35,7 +35,7 @@ class PageTable:
 def stages(run: Run) -> PageTable:
     """Return method and time of every stage."""
     known = run.report.stages
-    total = sum(stage.seconds for stage in known.values()) or 1.0
+    total = run.report.seconds or 1.0
     rows = [
         (name, _method(name, stage, run), _seconds(stage.seconds), f"{100 * stage.seconds / total:.0f}{NBSP}%")
         for name, stage in known.items()
@@ -62,13 +62,13 @@ def more_samples(run: Run) -> PageTable | None:
 
     The error is that of this run's estimator. The optimal one for less noise relies less on the prior and is better.
     """
-    spent = run.report.spent
-    if not spent.more or not is_trusted(run.report):
+    more_samples = run.report.more_samples
+    if not more_samples or not is_trusted(run.report):
         return None
-    present = ("as in this run", sum(spent.stages.values()), run.report.error.predicted_mse)
-    known = [present, *((f"{more.times} times as many", more.seconds, more.predicted_mse) for more in spent.more)]
+    present = ("as in this run", run.report.seconds, run.report.error.predicted_mse)
+    known = [present, *((f"{more.times} times as many", more.seconds, more.predicted_mse) for more in more_samples)]
     rows = [(name, _seconds(seconds), f"{mse:.4g}") for name, seconds, mse in known]
-    rows.append(("unlimited", "", f"{spent.noise_alone:.4g}"))
+    rows.append(("unlimited", "", f"{run.report.noise_alone:.4g}"))
     header = ("samples", "time", "mean squared error with this estimator")
     return PageTable("Predicted error with more samples", header, rows)
 
@@ -80,8 +80,8 @@ def time_limit(run: Run) -> str:
         return ""
     chosen = ", ".join(f"{key} = {value}" for key, value in spent.chosen.items())
     return (
-        f"Time limit: {spent.within:g}{NBSP}s. The run took {_seconds(spent.seconds)} including trial measurements,"
-        f" and chose {chosen}."
+        f"Time limit: {spent.within:g}{NBSP}s. The run took {_seconds(spent.seconds or 0.0)}"
+        f" including trial measurements, and chose {chosen}."
     )
 
 

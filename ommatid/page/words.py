@@ -74,8 +74,6 @@ def numbers_beside(report: RunReport) -> dict[str, str]:
     if error.psnr is not None:
         gain = "" if error.gain is None else f" ({error.gain:+.1f} dB)"
         numbers["estimate"] = f"{error.psnr:.1f} dB{gain}"
-    if error.baseline is not None and error.baseline.psnr is not None:
-        numbers["single"] = f"{error.baseline.psnr:.1f} dB"
     for each in report.baselines:
         if each.psnr is not None:
             numbers[each.method] = f"{each.psnr:.1f} dB"

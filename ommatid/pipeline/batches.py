@@ -1,40 +1,66 @@
-"""Batches of scenes as the commands ask for them, with the tables and pages that describe a whole batch."""
+"""Batches of scenes, in this process, in several, or on a cluster, with the table and the page of the whole batch.
+
+Failures of scenes are independent. The numbers do not depend on where a scene is run, nor on the scenes beside it.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ommatid.analysis.summary import Section
 from ommatid.batch import sweep
-from ommatid.batch.batch import Batch, Description, Member
-from ommatid.batch.remote import RunObserver, Stages
-from ommatid.batch.sweep_row import SweepRow, summary
+from ommatid.batch.batch import Description, Member, check_files
+from ommatid.batch.remote import RunObserver, SceneOutcome, ScenePackage, Stages, carry_out, outcome_of, packed, unpack
+from ommatid.batch.sweep_row import summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.page.batch_index import cached_index, check_index
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.errors import InputError, MachineError, NotStartedError
 from ommatid.runtime.execution.cluster import Cluster
+from ommatid.runtime.execution.pool import check_options, worker_pool
+from ommatid.runtime.execution.workers import Completed
 from ommatid.runtime.outputs.kinds import check_folder
-from ommatid.runtime.outputs.occupied import occupied
+from ommatid.runtime.outputs.occupied import new_folder, occupied
 from ommatid.runtime.printable import printable_sentence
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.formats import picture
 
 from .stages import library_versions, open_member, process_count
 
+# Each scene with a function that returns its description, or raises its error.
+Runs = Generator[tuple[Member, Callable[[], Description]]]
 
-@dataclass(frozen=True)
+
+@dataclass
 class BatchOutcome:
     """The results of a batch: a JSON document per scene, the table of a sweep, and the worst exit code."""
 
-    documents: list[Description]
-    sections: list[Section]
-    exit_code: int
+    documents: list[Description] = field(default_factory=list[Description])
+    sections: list[Section] = field(default_factory=list[Section])
+    exit_code: int = 0
+
+
+@dataclass(frozen=True)
+class BatchFiles:
+    """Where the table of a sweep and the page of the batch are written, if anywhere; figures : files of the figure."""
+
+    sweep: Path | None = None
+    index: Path | None = None
+    figures: FigureFiles = SCREEN_PNG
+
+    def check(self) -> None:
+        """Raise InputError before any work if they could not be written, or would replace other files."""
+        for folder in (self.index, self.sweep):
+            if folder is not None:
+                check_folder(folder)
+        if self.index is not None:
+            check_index(self.index)
 
 
 def batch_members(
@@ -65,13 +91,6 @@ def batch_warnings(members: Sequence[Member]) -> list[str]:
     return [sentence for sentences in of_picture.values() for sentence in sentences]
 
 
-def scene_batch(
-    stages: Stages, observe: Callable[[Path], RunObserver], report: Callable[[Member, Description], Description]
-) -> Batch:
-    """Create the batch that does `stages` with every scene, and passes each result to `report`."""
-    return Batch(open_member, stages, observe, report, library_versions, process_count)
-
-
 def share_of_job(job: str, members: Sequence[Member], scheduler: str = "") -> tuple[list[Member], str]:
     """Return the scenes of the job that `--job` names, all without that option, and a sentence on the job.
 
@@ -87,6 +106,125 @@ def share_of_job(job: str, members: Sequence[Member], scheduler: str = "") -> tu
     return share, f"job {number} of {count}: {len(share)} of {len(members)} scenes{tables}"
 
 
+@dataclass(frozen=True)
+class Batch:
+    """The work on the scenes of a batch.
+
+    stages : runs a scene and returns its description;  observe : creates the observer for a folder
+    report : reports a description to the user, and returns it
+    """
+
+    stages: Stages
+    observe: Callable[[Path], RunObserver]
+    report: Callable[[Member, Description], Description]
+
+    def run(self, members: Sequence[Member], cluster: Cluster | None = None, count: int | None = None) -> Runs:
+        """Yield every scene with a function that returns its description or raises its error.
+
+        Scenes run in `count` processes or on `cluster`; without either, in as many processes as
+        finish soonest, given the scenes, processors and memory. A single process is this one, which shows progress.
+        """
+        check_options(cluster, count)
+        if cluster is not None:
+            yield from self._on_cluster(members, cluster)
+            return
+        count = min(process_count(members) if count is None else count, len(members))
+        work = partial(_run_member, self.stages, None if count > 1 else self.observe)
+        with worker_pool(count=count) as pool:
+            yield from self._collected(pool.each(work, members), members)
+
+    def _on_cluster(self, members: Sequence[Member], cluster: Cluster) -> Runs:
+        """Yield scenes with errors that show already here, then the others as they end."""
+        waiting: list[Member] = []
+        auto_variant = False
+        for member in members:
+            try:
+                setup = open_member(member)
+                check_files(setup, member.folder)
+                with new_folder(member.folder):  # fails before any work if there can be none
+                    waiting.append(member)
+            except Exception as error:
+                yield member, partial(_raise, error)
+                continue
+            auto_variant |= setup.scene.render.variant == "auto"
+        if not waiting:
+            return
+        with worker_pool(cluster) as pool:
+            pool.check_versions(partial(library_versions, auto_variant))
+            packages = map(_packed, waiting)  # as workers become free: all images might not fit into memory
+            yield from self._collected(pool.each(partial(carry_out, self.stages), packages), waiting)
+
+    def _collected(self, tasks: Iterable[Completed[SceneOutcome]], members: Sequence[Member]) -> Runs:
+        """Yield the scenes of tasks as they end, then those left over if connection or processes are lost."""
+        waiting = dict.fromkeys(range(len(members)))
+        failed: dict[Member, Exception] = {}
+        try:
+            for ended in tasks:
+                if ended.loss is not None:
+                    raise ended.loss
+                del waiting[ended.index]
+                yield members[ended.index], partial(self._collect, members[ended.index], ended)
+        except MachineError as error:
+            failed = _unfinished([members[index] for index in waiting], error)
+        for member, error in failed.items():
+            yield member, partial(_raise, error)
+
+    def _collect(self, member: Member, ended: Completed[SceneOutcome]) -> Description:
+        """Write the files that a worker returned, and report its stages. Raises the worker's error.
+
+        A scene that was refused leaves no files.
+        """
+        try:
+            outcome = ended.result()
+        except MachineError as error:
+            raise MachineError(f"{member.scene}: {error}") from error
+        if (outcome.files or outcome.removed) and (outcome.done or not isinstance(outcome.error, InputError)):
+            with occupied(member.folder):
+                unpack(outcome, member.folder)
+        observer = self.observe(member.folder)
+        for stage, executed in outcome.done.items():
+            observer.done(stage, executed)
+        if outcome.error is not None:
+            raise outcome.error
+        return self.report(member, outcome.description)
+
+
+def _run_member(stages: Stages, observe: Callable[[Path], RunObserver] | None, member: Member) -> SceneOutcome:
+    """Run a scene, which reads its files and writes to its folder; `observe` sees it, None in another process."""
+
+    def work(observer: RunObserver) -> Description:
+        return stages(open_member(member), member.folder, observer)
+
+    if observe is None:
+        return outcome_of(work)
+    try:
+        return SceneOutcome({}, {}, work(observe(member.folder)))
+    except Exception as error:
+        return SceneOutcome({}, {}, {}, error)
+
+
+def _packed(member: Member) -> ScenePackage | SceneOutcome:
+    """Return the package of a scene, or why there is none."""
+    try:
+        return packed(open_member(member), member.folder)
+    except Exception as error:  # a file was removed since it was checked
+        return SceneOutcome({}, {}, {}, error)
+
+
+def _unfinished(members: Sequence[Member], error: MachineError) -> dict[Member, Exception]:
+    """Return an error for each scene that is left when a cluster or a process fails; the first counts the others."""
+    if not members:
+        return {}
+    first, *others = members
+    count = f" and {len(others)} more" if others else ""
+    failures: dict[Member, Exception] = {first: MachineError(f"{first.scene}{count}: {error}")}
+    return failures | {member: NotStartedError(f"{member.scene}: {error}") for member in others}
+
+
+def _raise(error: Exception) -> Description:
+    raise error
+
+
 def run_batch(
     batch: Batch,
     members: Sequence[Member],
@@ -95,25 +233,17 @@ def run_batch(
     workers: int | None = None,
     progress: Progress = no_progress,
     *,
-    sweep_folder: Path | None = None,
-    index_folder: Path | None = None,
+    files: BatchFiles = BatchFiles(),
     with_folders: bool = True,
-    figures: FigureFiles = SCREEN_PNG,
 ) -> BatchOutcome:
     """Run every scene of a batch, even if others fail.
 
     report_failure : returns the exit code of an exception;  with_folders : documents of a sweep name the folders
-    figures : files of the sweep's figure
-    sweep_folder, index_folder : where the table of a sweep and the page of the batch are written, if anywhere
     Where all scenes fail, neither table nor page is written.
     """
-    for folder in (index_folder, sweep_folder):
-        if folder is not None:
-            check_folder(folder)  # before any work
-    if index_folder is not None:
-        check_index(index_folder)
+    files.check()
     results: dict[Member, Description] = {}
-    failures: dict[Member, str] = {}
+    failures: dict[Path, str] = {}
     codes = [0]
     for number, (member, work) in enumerate(batch.run(members, cluster, workers), 1):
         document = _heading(member, with_folders)
@@ -122,22 +252,38 @@ def run_batch(
         except Exception as error:
             codes.append(report_failure(error))
             reason = printable_sentence(error)
-            failures[member] = reason or type(error).__name__
+            failures[member.folder] = reason or type(error).__name__
             results[member] = {**document, "error": reason, "exit_code": codes[-1]}
         progress(number / len(members))
-    documents = [results[member] for member in members]
-    rows = [summary(results[member]) for member in members if member.changes]
-    if len(failures) == len(members):  # leaves nothing behind
-        sweep_folder = index_folder = None
-    folder = (sweep_folder if rows else None) or index_folder
+    if len(failures) == len(members):
+        files = BatchFiles()
+    outcome = BatchOutcome([results[member] for member in members], exit_code=max(codes))
+    _write_files(outcome, members, failures, files, report_failure)
+    return outcome
+
+
+def _write_files(
+    outcome: BatchOutcome,
+    members: Sequence[Member],
+    failures: dict[Path, str],
+    files: BatchFiles,
+    report_failure: Callable[[Exception], int],
+) -> None:
+    """Write table and page, and complete `outcome`."""
+    pairs = zip(members, outcome.documents, strict=True)
+    rows = [summary(document) for member, document in pairs if member.changes]
+    folder = (files.sweep if rows else None) or files.index
     with nullcontext() if folder is None or not (rows or folder.is_dir()) else occupied(folder):
-        sections = _sweep_sections(rows, sweep_folder, figures) if rows else []
-        if index_folder is not None:
+        if rows and files.sweep is not None:
+            write_sweep(files.sweep, rows, files.figures)
+        if rows:
+            title = "Sweep" if files.sweep is None else f"Sweep: {files.sweep / 'sweep.csv'}"
+            outcome.sections.append((title, lines(rows)))
+        if files.index is not None:
             try:
-                cached_index(index_folder, {member.folder: failures.get(member, "") for member in members})
+                cached_index(files.index, {member.folder: failures.get(member.folder, "") for member in members})
             except Exception as error:
-                codes.append(report_failure(error))
-    return BatchOutcome(documents, sections, max(codes))
+                outcome.exit_code = max(outcome.exit_code, report_failure(error))
 
 
 def _heading(member: Member, with_folder: bool) -> dict[str, Any]:
@@ -146,10 +292,3 @@ def _heading(member: Member, with_folder: bool) -> dict[str, Any]:
         document |= {"folder": str(member.folder)} if with_folder else {}
         document["values"] = member.values
     return document
-
-
-def _sweep_sections(rows: list[SweepRow], folder: Path | None, figures: FigureFiles) -> list[Section]:
-    if folder is None:
-        return [("Sweep", lines(rows))]
-    write_sweep(folder, rows, figures)
-    return [(f"Sweep: {folder / 'sweep.csv'}", lines(rows))]

@@ -20,7 +20,7 @@ from ommatid.page.batch_index import INDEX, cached_index, write_film_index
 from ommatid.reconstruct.output import result_files, run_json
 from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture, clear_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
-from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport, of_stages
+from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport
 from ommatid.reconstruct.restore import check_camera
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster
@@ -153,7 +153,7 @@ def finish_folder(
     if made:
         remove_study(folder)
     elif earlier is not None:  # of a run, which says more
-        report = of_stages(earlier)
+        report = earlier.of_stages()
     files = max(perf_counter() - begun - report.stages["reconstruct"].seconds, 0.0)
     results = StageResults(report, recorded, calibrated, made, files)
     return finish(results, folder, SILENT), made

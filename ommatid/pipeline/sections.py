@@ -50,8 +50,8 @@ def predicted_sections(members: Sequence[Member], outcome: BatchOutcome, detail:
     if detail == "verdict" or outcome.sections or not pairs:
         return outcome.sections if detail == "summary" else []
     names = [Path(document["scene"]).stem for _, document in pairs]
-    predictions = [prediction_table.prediction_of(document) for _, document in pairs]
-    return [("Expected errors (Eq. 5)", [("scene", *names), *prediction_table.compared(predictions)])]
+    compared = prediction_table.rows([document for _, document in pairs])
+    return [("Expected errors (Eq. 5)", [("scene", *names), *compared])]
 
 
 def predicted_lines(documents: Iterable[dict[str, Any]]) -> list[str]:
@@ -67,12 +67,11 @@ def predicted_lines(documents: Iterable[dict[str, Any]]) -> list[str]:
 
 def _prediction_sections(scene: Scene, document: dict[str, Any]) -> list[Section]:
     """Tabulate a prediction, and the electrons that the pixels collect where the scene has a sensor."""
-    prediction, tolerance = prediction_table.prediction_of(document), scene.camera.tolerance
-    lines = prediction_table.rows(prediction)
+    lines = prediction_table.rows([document])
     if (
-        any(sentence.startswith(predict.LEFT_OUT) for sentence in prediction.assumes)
-        and tolerance is not None
-        and prediction.misalignment is None
+        any(sentence.startswith(predict.LEFT_OUT) for sentence in document["assumes"])
+        and scene.camera.tolerance is not None
+        and "misalignment" not in document
         and scene.estimator.misalignment == "trust"
     ):
         lines.append(("misalignment", "not included; it is predicted for small targets and sharp lenses only"))

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from ommatid.batch.batch import Member, check_files, prepare
+from ommatid.batch.batch import RENDERED, Member, check_files, clear_results, prepare
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.run_json import FILES, PAGE, RunReport, with_stage
+from ommatid.reconstruct.output.estimate_formats import Format, write_formats
+from ommatid.reconstruct.output.run_json import FILES, PAGE, RunReport
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.machine import one_thread, processors
+from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
 from ommatid.scenes.model import Model
@@ -75,6 +76,8 @@ def process_count(members: Sequence[Member]) -> int:
     """Return the number of processes that finishes a batch soonest, of as many as fit into memory."""
     from ommatid.batch.plan import concurrent_by_memory, estimate_cost, fastest_process_count
 
+    if min(len(members), processors()) < 2:
+        return 1
     costs = [estimate_cost(member) for member in members]
     most = min(concurrent_by_memory([cost.memory for cost in costs]), len(members), processors())
     return fastest_process_count([cost.seconds for cost in costs], most, processors())
@@ -85,17 +88,35 @@ def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
     return finish(results(setup, folder, observer), folder, observer).plain()
 
 
-def with_figures(stages: Stages, figures: FigureFiles) -> Stages:
-    """Return stages that write the figures of a run in these files, too, even if the results are up to date."""
-    return stages if figures == SCREEN_PNG else partial(_and_figures, stages, figures)
+@dataclass(frozen=True)
+class SceneWork:
+    """Stages, and what else is done with a scene, even if its results are up to date, by one process at a time.
 
+    force : check of the stages, before results of an earlier run are removed; None: what is up to date stays
+    formats : of the estimate;  figures : files of the figures;  baselines : True to compare with other methods
+    A scene that is refused before it is rendered leaves nothing in its folder.
+    """
 
-def _and_figures(
-    stages: Stages, figures: FigureFiles, setup: Setup, folder: Path, observer: RunObserver
-) -> dict[str, Any]:
-    description = stages(setup, folder, observer)
-    write_figures(folder, figures)
-    return description
+    stages: Stages
+    force: Callable[[Setup, Path], None] | None = None
+    formats: tuple[Format, ...] = ()
+    figures: FigureFiles = SCREEN_PNG
+    baselines: bool = False
+
+    def __call__(self, setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
+        """Do the work, here or on a worker, and return the description."""
+        with occupied(folder, RENDERED):
+            if self.force is not None:
+                self.force(setup, folder)
+                clear_results(folder, setup)
+            description = self.stages(setup, folder, observer)
+            if self.baselines:
+                with observer.progress("baselines") as progress:
+                    description = add_baselines(folder, progress).plain()
+            if self.figures != SCREEN_PNG:
+                write_figures(folder, self.figures)
+            write_formats(folder / "estimate.exr", self.formats)
+            return description
 
 
 def write_figures(folder: Path, figures: FigureFiles) -> None:
@@ -109,17 +130,6 @@ def write_figures(folder: Path, figures: FigureFiles) -> None:
     write_overview(folder, stack, read_estimate(folder / ESTIMATE).channels, report, figures)
     if report.depth:
         draw(folder / PICTURE, stack.camera, report.depth, files=figures)
-
-
-def with_baselines(stages: Stages) -> Stages:
-    """Return stages that compare the estimate with other methods, even if the results are up to date."""
-    return partial(_and_baselines, stages)
-
-
-def _and_baselines(stages: Stages, setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
-    stages(setup, folder, observer)
-    with observer.progress("baselines") as progress:
-        return add_baselines(folder, progress).plain()
 
 
 def add_baselines(folder: Path, progress: Progress) -> RunReport:
@@ -190,7 +200,7 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
         report = report.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
         studied = _studied(setup, stack, folder, observer)
-        report = with_stage(report.with_changes(study=studied.cases), "study", studied.seconds)
+        report = report.with_changes(study=studied.cases).with_stage("study", studied.seconds)
     else:
         study.remove_study(folder)
     return StageResults(report, stack, model, made, max(files, 0.0), start_up)
@@ -206,7 +216,7 @@ def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunRep
     if earlier is not None and not results.made:
         files, page = (earlier.stages[name].seconds if name in earlier.stages else 0.0 for name in (FILES, PAGE))
         times = files, page, earlier.spent.start_up
-    report = run_json.with_times(results.report, *times)
+    report = results.report.with_times(*times)
     if earlier is None or report.plain() != earlier.plain():
         run_json.write(folder, report)
     return report

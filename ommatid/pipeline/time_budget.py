@@ -26,7 +26,7 @@ from ommatid.scenes.tables import toml
 
 from . import stages
 from .stages import StageResults, finish, write_page
-from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, bench_error_curves, error_curve
+from .time_allocation import ErrorCurve, TimeAllocation, allocate_time, error_curve
 
 FEW, MORE = 256, 1024  # samples per pixel of the two measuring runs
 MOST = 2**20  # samples per pixel of either stage
@@ -114,12 +114,10 @@ def run_within(
     remaining = left()
     if _needs_few_samples(setup):
         chosen, results = _adaptive_run(setup, folder, observer, few, remaining)
-    elif (curves := _bench_curves(folder, setup)) is not None or remaining > 2 * few.wall:
-        if curves is None:
-            more = _measured_run(setup, MORE, folder, observer, clock)
-            results, chosen, curves = more.results, (MORE, MORE), _fitted_curves(setup, few, more)
-            remaining = left()
-        allocation = _better(results.report.error, curves, remaining - few.other - COMPILATION)
+    elif remaining > 2 * few.wall:
+        more = _measured_run(setup, MORE, folder, observer, clock)
+        results, chosen = more.results, (MORE, MORE)
+        allocation = _better(results.report.error, _fitted_curves(setup, few, more), left() - few.other - COMPILATION)
         if allocation is not None:
             chosen = allocation.render, allocation.calibrate
             results = stages.results(_with_samples(setup, *chosen), folder, observer)
@@ -218,12 +216,6 @@ def _page_seconds(results: StageResults, folder: Path, observer: RunObserver, cl
     return clock() - start
 
 
-def _bench_curves(folder: Path, setup: Setup) -> Curves | None:
-    """Return the curves of `bench` from FEW samples on; `bench` begins with fewer than a scene can ask for."""
-    curves = bench_error_curves(folder, setup)
-    return None if curves is None else (curves[0].starting_at(FEW), curves[1].starting_at(FEW))
-
-
 def _fitted_curves(setup: Setup, few: MeasuredRun, more: MeasuredRun) -> Curves:
     curves: list[ErrorCurve] = []
     for stage, part in STAGES.items():
@@ -253,6 +245,5 @@ def _earlier_run(folder: Path, setup: Setup, requested: RequestedTime) -> TimeRe
 
 def _finish(results: StageResults, folder: Path, observer: RunObserver, spent: dict[str, Any]) -> dict[str, Any]:
     """Write page and run.json with the request and the times, and return the description."""
-    spent_in_all = TimeReport.model_validate({**results.report.spent.plain(), **spent})
-    report = results.report.with_changes(spent=spent_in_all)
+    report = results.report.with_changes(spent=TimeReport.model_validate(spent))
     return finish(replace(results, report=report), folder, observer).plain()

@@ -15,7 +15,7 @@ from ommatid.analysis.design import with_lens
 from ommatid.analysis.next_steps import NextStep, best_other_type, next_steps
 from ommatid.analysis.predict import predict_scene
 from ommatid.reconstruct.output.result_files import reconstruct
-from ommatid.reconstruct.output.run_json import MoreTime, RunReport, TimeReport, VerdictReport
+from ommatid.reconstruct.output.run_json import RunReport, StageReport, VerdictReport
 from ommatid.reconstruct.output.verdict_words import limit
 from ommatid.scenes.recording import expected_recording
 from ommatid.scenes.scene import Scene, parse
@@ -127,17 +127,16 @@ def test_a_camera_without_a_closed_form_is_not_compared_with_other_types() -> No
 def test_steps_are_ranked_by_their_gain_and_small_ones_left_out() -> None:
     report = run_of(variance=4.0)[1]
     now = report.error.predicted_mse
-    known = {2: (3.0, 0.6 * now), 4: (5.0, 0.1 * now)}
-    more = tuple(MoreTime(times=n, seconds=seconds, predicted_mse=mse) for n, (seconds, mse) in known.items())
     budget = {"noise": 0.5 * now, "quantisation": 0.06 * now, "rendering": 0.4 * now, "calibration": 0.04 * now}
-    spent = TimeReport(seconds=1.0, stages={}, noise_alone=0.0, more=more)
-    changed = report.with_changes(error=report.error.model_copy(update={"budget": budget}), spent=spent)
+    times = {"render": 1.0, "calibrate": 0.5, "reconstruct": 0.25}
+    stages = {name: StageReport(seconds=seconds, sampler="independent") for name, seconds in times.items()}
+    changed = report.with_changes(error=report.error.model_copy(update={"budget": budget}), stages=stages)
     by_samples = changed.error.model_copy(update={"budget": {"rendering": 0.9 * now}})
     sampled = changed.with_changes(error=by_samples)
     assert "; four times the samples (`render.samples`): RMS" in limit(sampled)
     steps = next_steps(changed)
     assert [step.change for step in steps] == ["4 times the samples", "half the noise variance"]
-    assert (steps[0].mse, steps[0].seconds) == (0.1 * now, 5.0)
+    assert (steps[0].mse, steps[0].seconds) == (pytest.approx((0.56 + 0.44 / 4) * now), 1.75 + 3 * 1.5)
     assert steps[0].how == "`render.samples` and `calibration.samples`"
     assert steps[1].mse == pytest.approx(0.75 * now)
     noisy = changed.with_changes(model=changed.model.model_copy(update={"spurious_information": 0.097}))

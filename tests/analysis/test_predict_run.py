@@ -184,7 +184,7 @@ def test_without_a_fast_backend_it_is_the_closed_form(monkeypatch: pytest.Monkey
     predicted, closed = predict_scene(scene), predict_scene(scene, rays=False)
     assert predicted.mse == closed.mse
     assert "scalar backend" in predicted.assumes[0]
-    assert rows(predicted)[0][0] == "assumes"
+    assert rows([json_of(predicted)])[0][0] == "assumes"
 
 
 def test_without_mitsuba_it_is_the_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits  # pyright: ignore[reportMissingTypeStubs]
 
-from ommatid.batch import batch
-from ommatid.batch.batch import Batch, Member, Runs
+from ommatid.batch import plan
+from ommatid.batch.batch import Member
 from ommatid.batch.plan import concurrent_by_memory, estimate_cost, fastest_process_count
+from ommatid.pipeline import stages
 from ommatid.reconstruct import method_choice
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY
 from ommatid.runtime import files
@@ -32,31 +31,15 @@ def test_a_run_removes_the_temporary_files_of_a_killed_one(kept: Path, ommatid: 
 # --- the number of processes
 
 
-def unused(*arguments: Any) -> Any:
-    raise AssertionError(f"called with {arguments}")
-
-
 @pytest.mark.parametrize(("fit", "cores", "expected"), [(9, 4, 3), (2, 4, 2), (1, 4, 1), (9, 2, 2), (9, 1, 1)])
 def test_processes_are_limited_by_scenes_processors_and_memory(
     fit: int, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch, "processors", lambda: cores)
-    counts: list[int] = []
-
-    class Counted(Batch):
-        def _in_processes(self, members: Sequence[Member], count: int) -> Runs:
-            counts.append(min(count, len(members)))
-            yield from ()
-
-        def _in_this_process(self, members: Sequence[Member]) -> Runs:
-            counts.append(min(1, len(members)))
-            yield from ()
-
+    monkeypatch.setattr(stages, "processors", lambda: cores)
+    monkeypatch.setattr(plan, "concurrent_by_memory", lambda _: fit)
+    monkeypatch.setattr(plan, "fastest_process_count", lambda _, most, __: most)
     three = [Member(Path(f"{name}.toml"), Path(name)) for name in "abc"]
-    counted = Counted(unused, unused, unused, unused, unused, lambda _: fit)
-    for members, count in ((three, None), (three, 1), (three, 7), (three[:1], 7)):
-        assert list(counted.run(members, count=count)) == []
-    assert counts == [expected, 1, 3, 1]
+    assert [stages.process_count(members) for members in (three, three[:1])] == [expected, 1]
 
 
 def test_memory_is_that_of_the_largest_scenes(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -189,7 +189,7 @@ def _line(report: RunReport) -> str:
     place = {True: "inside", False: "OUTSIDE", None: "no interval"}[is_inside(report)]
     verdict = "red" if is_red(report) else "trusted"
     of_equation = "".join(f"{ratio:.3f} of Eq. 5, " for ratio in ratios([report])[0])
-    return f"error {report.error.mse:.4g}, {of_equation}{place}, {verdict}, {report.spent.seconds:.1f} s"
+    return f"error {report.error.mse:.4g}, {of_equation}{place}, {verdict}, {report.seconds:.1f} s"
 
 
 def _with_error(values: Sequence[float]) -> str:

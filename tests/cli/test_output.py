@@ -35,7 +35,7 @@ def stored(folder: Path) -> Any:
 def test_six_lines_are_printed_of_a_scene(kept: Path, ommatid: Command) -> None:
     lines = ommatid(*RUN).out.splitlines()
     run = stored(kept)
-    error, baseline = run["error"], run["error"]["baseline"]
+    error, [baseline] = run["error"], run["baselines"]
     assert len(lines) == 6
     assert lines[0] == f"tiny: not to be trusted: {'; '.join(run['verdict']['reasons'])}"
     assert [line.split()[0] for line in lines[1:]] == ["error", "quality", "limit", "time", "page"]
@@ -195,7 +195,7 @@ def test_several_scenes_are_compared_and_swept_by_dots_and_for_every_lens_type(
     rows = {name.strip(): [cell.strip() for cell in cells] for name, cells in rows.items()}
     alone = [document(ommatid("predict", name, "--no-rays", "--json"))[0] for name in ("tile19", "single")]
     assert rows["scene"] == ["tile19", "single"]
-    assert rows["squared error (MSE)"] == [f"{each['mse']:.6g}" for each in alone]
+    assert rows["squared error (Eq. 5)"] == [f"{each['mse']:.6g}" for each in alone]
     assert rows["measurements"] == [str(each["measurements"]) for each in alone]
     sweep = ("predict", "tile19", "--no-rays", "--sweep", "noise.bits=8,...,10", "-q")
     assert [line.partition(":")[0] for line in ommatid(*sweep).out.splitlines()] == [

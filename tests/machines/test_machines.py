@@ -59,7 +59,6 @@ def test_nothing_is_written_elsewhere(elsewhere: Path) -> None:
 
 
 def test_no_time_is_negative_where_the_clock_goes_back(elsewhere: Path) -> None:
-    spent = json.loads((finished_folder(elsewhere) / "run.json").read_text(encoding="utf-8"))["spent"]
-    assert spent["start_up"] > 0.0
-    assert spent["seconds"] > 0.0
-    assert min(spent["stages"].values()) >= 0.0
+    report = json.loads((finished_folder(elsewhere) / "run.json").read_text(encoding="utf-8"))
+    assert report["spent"]["start_up"] > 0.0
+    assert min(stage["seconds"] for stage in report["stages"].values()) >= 0.0

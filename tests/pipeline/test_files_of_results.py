@@ -317,7 +317,7 @@ def test_a_truth_that_is_known_later_counts(finished: Path, here: Path, ommatid:
 
 def test_the_page_of_a_run_keeps_what_the_run_said(kept: Path, ommatid: Command) -> None:
     document = json.loads((kept / "run.json").read_text(encoding="utf-8"))
-    document["spent"] |= {"within": 9.0, "chosen": {"render.samples": 16}}
+    document["spent"] = {"within": 9.0, "chosen": {"render.samples": 16}}
     (kept / "run.json").write_text(json.dumps(document), encoding="utf-8")
     assert ommatid("report", kept / "stack.exr").code == 0
     spent = run_json.read(kept).spent

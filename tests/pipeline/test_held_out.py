@@ -69,13 +69,13 @@ def test_a_run_stores_its_check_and_the_page_shows_it(altered: Path, ommatid: Co
     wrong = run_json.RunReport.model_validate(report).held_out
     assert wrong is not None
     run = read_run(altered)
-    shown = page(replace(run, report=run.report.with_changes(held_out=wrong)), None, None, "stamp")
+    shown = page(replace(run, report=run.report.with_changes(held_out=wrong)), None, "stamp")
     section = shown.split('<details id="held-out"')[1].split("</details>")[0]
     assert "Not to be trusted: sub-imager I.01.01 contradicts the others" in section
     cells = re.findall(r'<td( class="named")? style[^>]*title="([^"]*)"', section)
     assert len(cells) == 9
     assert [words.split(":")[0] for named, words in cells if named] == ["I.01.01"]
-    without = page(replace(run, report=run.report.with_changes(held_out=None)), None, None, "stamp")
+    without = page(replace(run, report=run.report.with_changes(held_out=None)), None, "stamp")
     assert "ommatid check stack.exr model.npz" in without.split('<details id="held-out"')[1].split("</details>")[0]
 
 

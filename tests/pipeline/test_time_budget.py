@@ -14,23 +14,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ommatid.batch.remote import RunObserver
-from ommatid.bench import table
 from ommatid.pipeline.time_allocation import (
     NEGLIGIBLE,
     STEPS,
     ErrorCurve,
     allocate_time,
-    bench_error_curves,
     error_curve,
 )
 from ommatid.pipeline.time_budget import FEW, KEYS, MORE, run_within, shared_time
-from ommatid.reconstruct.output.run_json import RunReport, time_spent
+from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.units import DURATION
 
-from ..bench.tables import bench_table, cell, exactly
 from ..conftest import Command
 from ..examples import scene
 
@@ -190,72 +187,6 @@ def test_samples_of_a_world_are_not_adaptive(tmp_path: Path) -> None:
     assert "auto" not in description["spent"]["chosen"].values()
 
 
-# --- curves of `bench`
-
-
-def write_bench(folder: Path, setup: Setup, laws: dict[table.Stage, ErrorCurve], counts: tuple[int, ...]) -> None:
-    """Write the results of `bench` that follow these laws exactly."""
-    ways = {"render": "independent", "calibrate": "points, independent"}
-    cells = [
-        cell(
-            stage,
-            way=ways[stage],
-            variant="scalar_rgb",
-            samples=n,
-            seconds=exactly(law.seconds(n)),
-            mse=exactly(law.error(n)),
-        )
-        for stage, law in laws.items()
-        for n in counts
-    ]
-    # Cells with an adaptive number of samples are not part of a curve.
-    adaptive = {"samples": 2**26, "setting": table.AUTO, "seconds": exactly(1e3), "mse": exactly(1e-3)}
-    cells += [fixed.model_copy(update=adaptive) for fixed in cells[::2]]
-    slopes = [
-        table.ConvergenceCurve(
-            stage=stage,
-            way=ways[stage],
-            variant="scalar_rgb",
-            slope=-law.exponent / 2,
-            slope_deviation=0.01,
-            theory=None,
-            why="",
-            agrees=None,
-        )
-        for stage, law in laws.items()
-    ]
-    table.write(folder, bench_table(setup.camera, cells, slopes))
-
-
-def test_curves_of_bench_are_used_for_the_same_camera_only(tmp_path: Path) -> None:
-    setup = setup_of()
-    laws: dict[table.Stage, ErrorCurve] = {
-        "render": ErrorCurve(0.5, 256, 1.0, 0.2, 1e-4),
-        "calibrate": ErrorCurve(2.0, 256, 1.5, 0.4, 1e-3),
-    }
-    most = 2**24
-    write_bench(tmp_path, setup, laws, (256, most))
-    curves = bench_error_curves(tmp_path / "x", setup)
-    assert curves is not None
-    floor = min(law.error(most) for law in laws.values())  # the smallest error of the table is taken for the floor
-    for law, curve in zip(laws.values(), curves, strict=True):
-        assert curve.exponent == law.exponent
-        assert curve.seconds(5000) == pytest.approx(law.seconds(5000))
-        assert curve.error(5000) == pytest.approx(law.error(5000) * (1 - floor / law.part))
-    other = Setup.from_scene(scene((14, 14), (("1/3", [3, 3], [3, 3]),)))
-    assert bench_error_curves(tmp_path / "x", other) is None
-
-
-@pytest.mark.slow
-def test_curves_of_bench_never_lead_to_fewer_samples_than_the_measuring_runs(tmp_path: Path) -> None:
-    """`bench` begins at 4 samples, fewer than a scene can ask for; under much noise these would be the fastest."""
-    setup = setup_of()
-    flat = ErrorCurve(1e-9, 4, 1.0, 1e-3, 1e-6)
-    write_bench(tmp_path, setup, {"render": flat, "calibrate": flat}, (4, 2**14))
-    description, _ = within(tmp_path / "x", setup, 600.0, ticking(1e-3))
-    assert min(description["spent"]["chosen"].values()) >= FEW
-
-
 # --- commands
 
 
@@ -264,15 +195,12 @@ def test_every_run_reports_the_gain_from_more_time(here: Path, ommatid: Command)
     assert ended.code == 0, ended.err
     assert "in more time" not in ended.out, "the verdict comes first: more samples are no remedy that is certain"
     run = RunReport.model_validate_json((here / "out/tiny/run.json").read_bytes())
-    error, spent = run.error, run.spent
-    assert spent.seconds == pytest.approx(sum(stage.seconds for stage in run.stages.values()))
-    errors = [more.predicted_mse for more in spent.more]
-    assert error.predicted_mse > errors[0] > errors[1] > errors[2] > spent.noise_alone
-    assert spent.noise_alone == pytest.approx(
+    error = run.error
+    errors = [more.predicted_mse for more in run.more_samples]
+    assert error.predicted_mse > errors[0] > errors[1] > errors[2] > run.noise_alone
+    assert run.noise_alone == pytest.approx(
         error.predicted_mse - error.budget["rendering"] - error.budget["calibration"]
     )
-    computing = {name: stage for name, stage in run.stages.items() if name not in ("files", "page")}
-    assert time_spent(computing, error, calibrated=True).more == spent.more
 
 
 def test_times_are_read_and_wrong_ones_refused(here: Path, ommatid: Command) -> None:

@@ -18,7 +18,7 @@ import pytest
 from dask import config
 from distributed import LocalCluster, Security
 
-from ommatid.batch.batch import Batch
+from ommatid.pipeline.batches import Batch
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution import workers
 from ommatid.runtime.execution.cluster import SILENT, Cluster, cluster_workers

@@ -16,7 +16,6 @@ from .run_json import (
     RunReport,
     SolverReport,
     StageReport,
-    TimeReport,
 )
 from .verdict_words import cause, error_words, grounds, heading, is_trusted, limit
 
@@ -64,13 +63,13 @@ def facts(report: RunReport) -> list[Fact]:
         *_error(report.error),
         *map(region, report.regions),
         *_quality(report),
-        *(Fact(f"MSE by {name}", mse, f"PSNR {psnr}, {time}") for name, mse, psnr, _, time in _baselines(report)),
+        *(Fact(f"MSE by {name}", mse, f"PSNR {psnr}, {time}") for name, mse, psnr, _, time in _compared(report)),
         Fact("limit", limit(report), topic="limit"),
         *_solver(report.solver),
         *_diagnostics(report.diagnostics),
         *_model(report.model),
         *(Fact(f"left out: {each.what}", skipped_words(each.why, each.bound)) for each in report.skipped),
-        *_time(report.spent, limits=is_trusted(report)),
+        *_time(report),
     ]
 
 
@@ -136,14 +135,14 @@ def baseline_rows(report: RunReport) -> list[tuple[str, str, str, str, str]]:
     error = report.error
     ours = _method_row("this estimate", error.mse or 0.0, error.psnr, error.ssim, report.stages["reconstruct"].seconds)
     pairs = [(error.mse or 0.0, ours)]
-    pairs += [(each.mse, row) for each, row in zip(report.baselines, _baselines(report), strict=True)]
+    pairs += [(each.mse, row) for each, row in zip(report.baselines, _compared(report), strict=True)]
     return [row for _, row in sorted(pairs, key=lambda pair: pair[0])]
 
 
 def baseline_words(report: RunReport) -> str:
     """Return which of the baselines have smaller errors than the estimate, as sentences; empty without baselines."""
     mse = report.error.mse
-    if mse is None or not report.baselines:
+    if mse is None or not _compared(report):
         return ""
     better = [each for each in report.baselines if each.mse < (1 - ALIKE) * mse]
     alike = [each for each in report.baselines if abs(each.mse - mse) <= ALIKE * mse]
@@ -158,9 +157,11 @@ def baseline_words(report: RunReport) -> str:
     return words
 
 
-def _baselines(report: RunReport) -> list[tuple[str, str, str, str, str]]:
-    """Return the rows of the baselines."""
-    single = report.error.baseline
+def _compared(report: RunReport) -> list[tuple[str, str, str, str, str]]:
+    """Return the rows of the baselines, none without `--baselines`, where there is at most the single sub-image."""
+    single = report.single
+    if len(report.baselines) < 2:
+        return []
     names = {"single": f"{METHODS['single']}, {single.sub_imager}"} if single is not None else {}
     return [
         _method_row((METHODS | names)[each.method], each.mse, each.psnr, each.ssim, each.seconds)
@@ -169,10 +170,10 @@ def _baselines(report: RunReport) -> list[tuple[str, str, str, str, str]]:
 
 
 def _method_row(
-    name: str, mse: float, psnr: float | None, ssim: float | None, seconds: float
+    name: str, mse: float, psnr: float | None, ssim: float | None, seconds: float | None
 ) -> tuple[str, str, str, str, str]:
     quality = "exact" if psnr is None else f"{psnr:.1f} dB"
-    return name, f"{mse:.4g}", quality, "" if ssim is None else f"{ssim:.4f}", f"{seconds:.2g} s"
+    return name, f"{mse:.4g}", quality, "" if ssim is None else f"{ssim:.4f}", f"{seconds or 0.0:.2g} s"
 
 
 def samples_of(stage: StageReport) -> str:
@@ -257,7 +258,7 @@ def _quality(report: RunReport) -> list[Fact]:
     found = [Fact("resolution", width, "median", of_image), Fact("degrees of freedom", freedom, topic=of_image)]
     if error.mse is None:
         return found
-    single = error.baseline
+    single = report.single
     psnr = "exact" if error.psnr is None else f"{error.psnr:.1f} dB"
     beside = "" if single is None or single.psnr is None else f"single sub-image: {single.psnr:.1f} dB"
     quality = [Fact("PSNR", psnr, beside, "quality")]
@@ -326,14 +327,14 @@ def _model(model: ModelReport) -> list[Fact]:
     return found
 
 
-def _time(spent: TimeReport, limits: bool) -> list[Fact]:
-    """limits : True to state what more time would bring"""
-    stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.stages.items())
-    found = [Fact("time", f"{sum(spent.stages.values()):.1f} s", stages, "time")]
+def _time(report: RunReport) -> list[Fact]:
+    spent, more = report.spent, report.more_samples
+    stages = ", ".join(f"{name} {stage.seconds:.1f} s" for name, stage in report.stages.items())
+    found = [Fact("time", f"{report.seconds:.1f} s", stages, "time")]
     if spent.within is not None:
         chosen = ", ".join(f"{key} {value}" for key, value in spent.chosen.items())
-        found.append(Fact("  of the time limit", f"{spent.seconds:.1f} s of {spent.within:g} s", chosen))
-    if spent.more and limits:
-        more = ", ".join(f"{more.predicted_mse:.4g} in {more.seconds:.3g} s" for more in spent.more[:2])
-        found.append(Fact("MSE with more samples", f"at most {more}", f"by noise alone {spent.noise_alone:.4g}"))
+        found.append(Fact("  of the time limit", f"{spent.seconds or 0.0:.1f} s of {spent.within:g} s", chosen))
+    if more and is_trusted(report):
+        words = ", ".join(f"{each.predicted_mse:.4g} in {each.seconds:.3g} s" for each in more[:2])
+        found.append(Fact("MSE with more samples", f"at most {words}", f"by noise alone {report.noise_alone:.4g}"))
     return found

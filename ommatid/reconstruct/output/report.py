@@ -16,24 +16,24 @@ from ..measured_error import best_single_sub_image
 from ..restore import Reconstruction
 from ..verdict.verdict import with_gain
 from .run_json import (
-    BaselineReport,
     DiagnosticsReport,
     ErrorReport,
     FittedNumber,
     IntervalReport,
+    MethodReport,
     ModelReport,
     RunReport,
     SeedReport,
     SkippedReport,
     StageReport,
-    time_spent,
 )
 
 
 def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunReport:
     """Return the content of run.json, without a fingerprint."""
     start = perf_counter()
-    held_out, error = _held_out(restoration, stack), _error(restoration, stack)
+    held_out, single = _held_out(restoration, stack), _single(restoration, stack)
+    error = _error(restoration, single)
     stages = {
         "render": _stage(stack.record),
         "calibrate": _stage(model.record),
@@ -70,8 +70,8 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
             data=stack.record.get("first_seed"),
             calibration=model.record.get("first_seed"),
         ),
-        spent=time_spent(stages, error, calibrated=model.record["method"] != "ideal"),
         **held_out,
+        **({} if single is None else {"baselines": (single,)}),
     )
 
 
@@ -87,13 +87,18 @@ def _stage(record: dict[str, Any]) -> StageReport:
     return StageReport(**{key: record[key] for key in StageReport.model_fields if key in record})
 
 
-def _error(restoration: Reconstruction, stack: Stack) -> ErrorReport:
-    measured: dict[str, Any] = {} if restoration.error is None else asdict(restoration.error)
+def _single(restoration: Reconstruction, stack: Stack) -> MethodReport | None:
+    """Return the error of the best single sub-image, None where the truth is not known."""
     single = best_single_sub_image(stack, restoration.truth)
+    if single is None or restoration.error is None:
+        return None
+    errors = {"mse": single.mse, "psnr": single.psnr, "ssim": single.ssim}
+    return MethodReport(method="single", sub_imager=single.name, **errors)
+
+
+def _error(restoration: Reconstruction, single: MethodReport | None) -> ErrorReport:
+    measured: dict[str, Any] = {} if restoration.error is None else asdict(restoration.error)
     if single is not None and restoration.error is not None:
-        measured["baseline"] = BaselineReport(
-            sub_imager=single.name, mse=single.mse, psnr=single.psnr, ssim=single.ssim
-        )
         psnr = restoration.error.psnr
         measured["gain"] = None if psnr is None or single.psnr is None else psnr - single.psnr
     if restoration.interval is not None:

@@ -189,13 +189,13 @@ def _is_whole(picture: Path) -> bool:
 
 
 def region_reports(outcome: Reconstruction, regions: Sequence[Region]) -> dict[str, Any]:
-    """Return `region` and `regions` of run.json: the means over parts of the estimate; nothing without regions."""
+    """Return `regions` of run.json: the means over parts of the estimate; nothing without regions."""
     reports = tuple(
         RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
         for corner, size in regions
         for mean, deviation in [outcome.region(corner, size)]
     )
-    return {"region": reports[0], "regions": reports} if reports else {}
+    return {"regions": reports} if reports else {}
 
 
 def cached_results(

@@ -7,10 +7,9 @@ None is null. Readers ignore keys that they do not know.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from math import log10
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, computed_field, field_validator, model_validator
 
@@ -33,62 +32,6 @@ EPS = 2.0**-52  # of float64
 Amount = Annotated[float, Field(ge=0, le=1e100)]  # a squared error, or a time in seconds
 Index = Annotated[int, Field(ge=0, lt=2**31)]
 BaselineMethod = Literal["single", "rearranged", "shift_and_add", "total_variation"]
-
-
-def time_spent(stages: Mapping[str, StageReport], error: ErrorReport, *, calibrated: bool) -> TimeReport:
-    """Return the seconds of a run and what more samples would cost and bring.
-
-    calibrated : whether H took samples
-    Errors with more samples are those of the estimator as it is. An estimator that expects the smaller noise does
-    better, most of all where much of its error is in components that the lens types hardly measure.
-    """
-    seconds = {name: stage.seconds for name, stage in stages.items()}
-    parts = [error.budget.get(part, 0.0) for part in STAGES.values()]
-    rest, total = max(error.predicted_mse - sum(parts), 0.0), sum(seconds.values())
-    sampler = stages["render"].sampler
-    if sampler is None:  # recorded frames
-        return TimeReport(seconds=total, stages=seconds, noise_alone=rest)
-    fall = INDEPENDENT if sampler == "independent" else STRATIFIED
-    growing = seconds["render"] + (seconds["calibrate"] if calibrated else 0.0)
-    more = tuple(
-        MoreTime(
-            times=times,
-            seconds=total + (times - 1) * growing,
-            predicted_mse=rest + sum(part * times**-fall for part in parts),
-        )
-        for times in MORE
-    )
-    return TimeReport(seconds=total, stages=seconds, noise_alone=rest, more=more)
-
-
-def with_stage(report: RunReport, name: str, seconds: float) -> RunReport:
-    """Return a report with the time of one more stage, which changes none of its other numbers."""
-    return _with_stages(report, {**report.stages, name: StageReport(seconds=seconds)})
-
-
-def of_stages(report: RunReport) -> RunReport:
-    """Return a report without the times of what surrounds its stages: start-up, files and page."""
-    computing = _with_stages(report, {name: each for name, each in report.stages.items() if name not in (FILES, PAGE)})
-    spent = computing.spent.plain()
-    spent.pop("start_up", None)
-    return computing.with_changes(spent=TimeReport.model_validate(spent))
-
-
-def with_times(report: RunReport, files: float, page: float, start_up: float | None) -> RunReport:
-    """Return the report of stages with the times of what surrounds them, in seconds."""
-    complete = with_stage(with_stage(report, FILES, files), PAGE, page)
-    changes: dict[str, Any] = {} if start_up is None else {"start_up": start_up}
-    if "more" in report.spent.model_fields_set:  # of the stages, which alone take samples
-        changes["more"] = report.spent.more
-    return complete.with_changes(spent=complete.spent.model_copy(update=changes))
-
-
-def _with_stages(report: RunReport, stages: dict[str, StageReport]) -> RunReport:
-    spent = time_spent(stages, report.error, calibrated=report.stages["calibrate"].method != "ideal")
-    asked = report.spent.model_dump(include={"within", "asked", "chosen", "start_up"}, exclude_unset=True)
-    if report.spent.within is not None:
-        asked["seconds"] = report.spent.seconds  # of all trials together
-    return report.with_changes(stages=stages, spent=TimeReport.model_validate({**spent.plain(), **asked}))
 
 
 class Record(BaseModel):
@@ -125,18 +68,10 @@ class IntervalReport(Record):
     high: Amount
 
 
-class BaselineReport(Record):
-    """The best single sub-image, enlarged to f's grid, and its error against the truth."""
-
-    sub_imager: str
-    mse: Amount
-    psnr: float | None
-    ssim: float | None
-
-
 class MethodReport(Record):
-    """Error of a baseline of `--baselines` against the truth, and its seconds.
+    """Error of a baseline against the truth, and its seconds, which `--baselines` measures.
 
+    sub_imager : of the best single sub-image, enlarged to f's grid
     weight : of total variation, per grey level, the one of least error
     """
 
@@ -144,14 +79,15 @@ class MethodReport(Record):
     mse: Amount
     psnr: float | None
     ssim: float | None
-    seconds: Amount
+    seconds: Amount | None = None
+    sub_imager: str | None = None
     weight: float | None = None
 
 
 class ErrorReport(Record):
     """Measured and predicted error; `budget` holds the parts of `predicted_mse` by cause.
 
-    gain : dB of `psnr` over that of the baseline, None if one of them is exact
+    gain : dB of `psnr` over that of the best single sub-image, None if one of them is exact
     predicted_mse : for images of the prior;  expected_given_truth, expected_given_estimate : if the image is this one,
         the latter where the truth is not known
     """
@@ -160,7 +96,6 @@ class ErrorReport(Record):
     trimmed_mse: Amount | None = None
     psnr: float | None = None
     ssim: float | None = None
-    baseline: BaselineReport | None = None
     gain: float | None = None
     predicted_mse: Amount
     predicted_trimmed_mse: Amount | None = None
@@ -278,12 +213,12 @@ class SkippedReport(Record):
     bound: float | None = None
 
 
-class MoreTime(Record):
+class MoreTime(NamedTuple):
     """Seconds and expected error of `times` as many samples."""
 
     times: int
-    seconds: Amount
-    predicted_mse: Amount
+    seconds: float
+    predicted_mse: float
 
 
 class RequestedTime(Record):
@@ -294,18 +229,16 @@ class RequestedTime(Record):
 
 
 class TimeReport(Record):
-    """Seconds of all stages, the gain from more samples, and the request of --within if there was one.
+    """Seconds beside those of the stages.
 
-    start_up : seconds from the start of the process to the first stage, where the process ran this scene alone
+    start_up : from the start of the process to the first stage, where the process ran this scene alone
+    within, asked, seconds, chosen : of --within: its share and the request, the time of all trials, and the samples
     """
 
-    seconds: Amount
-    stages: dict[str, Amount]
-    noise_alone: float
     start_up: float | None = None
-    more: tuple[MoreTime, ...] = ()
     within: float | None = None
     asked: RequestedTime | None = None
+    seconds: Amount | None = None
     chosen: dict[str, int | Literal["auto"]] = Field(default_factory=dict[str, int | Literal["auto"]])
 
 
@@ -493,9 +426,8 @@ class RunReport(Record):
     assumes: tuple[str, ...] = ()
     versions: dict[str, str]
     seeds: SeedReport
-    spent: TimeReport
+    spent: TimeReport = TimeReport()
     held_out: HeldOutReport | None = None
-    region: RegionReport | None = None
     regions: tuple[RegionReport, ...] = ()
     depth: tuple[DepthBin, ...] = ()
     study: tuple[StudyCase, ...] = ()
@@ -519,6 +451,59 @@ class RunReport(Record):
     def with_changes(self, **fields: object) -> RunReport:
         """Return a copy with some fields replaced."""
         return self.model_copy(update=fields)
+
+    def with_stage(self, name: str, seconds: float) -> RunReport:
+        """Return a copy with the time of one more stage."""
+        return self.with_changes(stages={**self.stages, name: StageReport(seconds=seconds)})
+
+    def with_times(self, files: float, page: float, start_up: float | None) -> RunReport:
+        """Return a copy with the times of what surrounds the stages, in seconds."""
+        timed = self.with_stage(FILES, files).with_stage(PAGE, page)
+        known = {} if start_up is None else {"start_up": start_up}
+        return timed.with_changes(spent=self.spent.model_copy(update=known))
+
+    def of_stages(self) -> RunReport:
+        """Return a copy without the times of what surrounds the stages."""
+        spent = self.spent.plain()
+        spent.pop("start_up", None)
+        return self.with_changes(stages=self._computing, spent=TimeReport.model_validate(spent))
+
+    @property
+    def single(self) -> MethodReport | None:
+        """The best single sub-image among the baselines, None where the truth is not known."""
+        return next((each for each in self.baselines if each.method == "single"), None)
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of all stages."""
+        return sum(stage.seconds for stage in self.stages.values())
+
+    @property
+    def noise_alone(self) -> float:
+        """Expected error without noise of rendering and calibration."""
+        return max(self.error.predicted_mse - sum(self.error.budget.get(part, 0.0) for part in STAGES.values()), 0.0)
+
+    @property
+    def more_samples(self) -> tuple[MoreTime, ...]:
+        """What more samples would cost and bring; nothing for recorded frames.
+
+        Errors with more samples are those of the estimator as it is. An estimator that expects the smaller noise does
+        better, most of all where much of its error is in components that the lens types hardly measure.
+        """
+        render, calibrate = self.stages["render"], self.stages["calibrate"]
+        if render.sampler is None:
+            return ()
+        parts = sum(self.error.budget.get(part, 0.0) for part in STAGES.values())
+        total = sum(stage.seconds for stage in self._computing.values())
+        growing = render.seconds + (calibrate.seconds if calibrate.method != "ideal" else 0.0)
+        fall = INDEPENDENT if render.sampler == "independent" else STRATIFIED
+        return tuple(
+            MoreTime(times, total + (times - 1) * growing, self.noise_alone + parts * times**-fall) for times in MORE
+        )
+
+    @property
+    def _computing(self) -> dict[str, StageReport]:
+        return {name: stage for name, stage in self.stages.items() if name not in (FILES, PAGE)}
 
 
 def write(folder: Path, report: RunReport) -> None:

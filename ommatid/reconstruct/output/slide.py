@@ -54,7 +54,7 @@ def write_slide(
     check_output(path, *check_run_folder(folder))
     stack = stack_file.read(folder / STACK)
     panels = result_panels(read_estimate(folder / ESTIMATE).channels)
-    best = run_json.read(folder).error.baseline
+    best = run_json.read(folder).single
     panels["sub-image"] = placed_sub_image(stack, best and best.sub_imager, panels["estimate"].scale)
     missing = [name for name in chosen if name not in panels]
     if missing:

@@ -105,7 +105,7 @@ def _change(name: str, part: float, report: RunReport) -> str:
         return f"; {words}: {_fall(now, now - (1 - change.factor) * part)}"
     if name not in SAMPLES or not follows_samples(report):
         return ""
-    more = next((more for more in report.spent.more if more.times == TIMES), None)
+    more = next((more for more in report.more_samples if more.times == TIMES), None)
     if more is not None and more.predicted_mse < (1 - LEAST_GAIN) * now:
         keys = " and ".join(key for part_name, key in SAMPLES.items() if error.budget.get(part_name))
         return f"; four times the samples ({keys}): {_fall(now, more.predicted_mse)}"

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 
 from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.output.run_json import Amount, Record, StudyCase
+from ommatid.reconstruct.output.run_json import StudyCase
 from ommatid.reconstruct.output.verdict_words import error_words
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import cached, fingerprint, write_csv, write_text
-from ommatid.runtime.input_files import read_record
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.model import Model
@@ -28,7 +24,6 @@ from ommatid.simulate.calibrate import cached_model
 from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 from ommatid.simulate.ideal import ideal_model, true_model
 
-NUMBERS, TABLE = "study.json", "study.csv"
 LABELS = {
     "ideal": "the ideal H",
     "points": "H of rendered point sources",
@@ -36,14 +31,6 @@ LABELS = {
     "fitted": "H fitted to the stack itself",
     "true": "the true H",
 }
-
-
-class StudyFile(Record):
-    """The content of study.json."""
-
-    fingerprint: str
-    seconds: Amount
-    cases: tuple[StudyCase, ...]
 
 
 def check_study(scene: Scene, camera: Camera) -> None:
@@ -78,44 +65,18 @@ def study_case(stack: Stack, name: StudyModel, model: Model, truth: FloatArray |
     )
 
 
-def cached_study(
-    folder: Path,
+def study_cases(
     stack: Stack,
     models: Mapping[StudyModel, Callable[[], Model]],
     truth: FloatArray | None,
     progress: Progress = no_progress,
-) -> tuple[StudyFile, bool]:
-    """Return the cases of a study and True if they had to be computed; writes study.json and study.csv.
-
-    models : by name, made only where they are needed
-    """
-    current = fingerprint([list(models), stack.record, stack.scene.plain(), truth is not None])
-
-    def make() -> StudyFile:
-        begun, cases = perf_counter(), list[StudyCase]()
-        for name, model in models.items():
-            cases.append(study_case(stack, name, model(), truth))
-            progress(len(cases) / len(models))
-        return StudyFile(fingerprint=current, seconds=perf_counter() - begun, cases=tuple(cases))
-
-    def write(folder: Path, study: StudyFile) -> None:
-        columns = list(StudyCase.model_fields)
-        write_csv(folder / TABLE, columns, (case.plain().values() for case in study.cases))
-        write_text(folder / NUMBERS, json.dumps(study.plain(), indent=2) + "\n")
-
-    return cached(folder, current, _read_study, make, write)
-
-
-def remove_study(folder: Path) -> None:
-    """Remove the study of an earlier result in a folder; its calibrated models stay."""
-    for name in (NUMBERS, TABLE):
-        (folder / name).unlink(missing_ok=True)
-
-
-def _read_study(folder: Path) -> tuple[StudyFile, str | None]:
-    """Return study.json, and its fingerprint if study.csv is there too."""
-    study: StudyFile = read_record(folder / NUMBERS, StudyFile, "a study", "run the scene again")
-    return study, study.fingerprint if (folder / TABLE).is_file() else None
+) -> tuple[StudyCase, ...]:
+    """Return a case for each model, which are made one after the other."""
+    cases: list[StudyCase] = []
+    for name, model in models.items():
+        cases.append(study_case(stack, name, model(), truth))
+        progress(len(cases) / len(models))
+    return tuple(cases)
 
 
 def rows(cases: Sequence[StudyCase]) -> list[tuple[str, str]]:

@@ -26,7 +26,7 @@ OTHERS = "model.npz", "run.json", "report.html"
 # What the stages write; the calibrated models of a study and interrupted work are beside them.
 ESTIMATES = ("estimate.exr", "estimate.npy", "estimate.tiff")
 RENDERED = "stack.exr"
-RESULTS = (RENDERED, "model*.npz", "run.json", *ESTIMATES, "study.json", "report.html", ".*.partial.npz")
+RESULTS = (RENDERED, "model*.npz", "run.json", *ESTIMATES, "report.html", ".*.partial.npz")
 
 
 @dataclass(frozen=True)

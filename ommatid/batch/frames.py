@@ -24,11 +24,12 @@ from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import check_camera, check_region
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.pool import worker_pool
+from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint, temporary_file
 from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.kinds import check_folder, check_name
 from ommatid.runtime.outputs.occupied import new_folder
-from ommatid.runtime.progress import Progress
+from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import origin
 from ommatid.scenes import model_file
 from ommatid.scenes import stack as stack_file
@@ -108,8 +109,7 @@ def reconstruct_frames(
     for output in outputs:
         check_formats(output, options.formats)
     check_folder(folder)
-    common = [file_digest(options.model), options.changes, options.lenses, options.regions]
-    pairs = zip(stacks, outputs, strict=True)
+    common, pairs = _common(options), zip(stacks, outputs, strict=True)
     frames = [Frame(stack, output, _made_from(stack, common)) for stack, output in pairs]
     return _reports(folder, frames, Prepared(model), options, workers, progress)
 
@@ -148,6 +148,11 @@ def _check(path: Path, model: Model, options: FrameOptions) -> None:
     result_files.with_estimator_changes(nothing, list(options.changes), path)
     for region in options.regions:
         check_region(*region, camera.shape)
+
+
+def _common(options: FrameOptions) -> list[Any]:
+    """Return what all frames are made from."""
+    return [file_digest(options.model), options.changes, options.lenses, options.regions]
 
 
 def _made_from(stack: Path, common: list[Any]) -> str:
@@ -201,12 +206,26 @@ def _in_processes(frames: Sequence[Frame], prepared: Prepared, options: FrameOpt
                 yield others[task.index], task.result
 
 
-def _made(frame: Frame, prepared: Prepared, options: FrameOptions) -> tuple[RunReport, bool]:
+def reconstruct_file(
+    stack: Path, output: Path, options: FrameOptions, workers: Workers | None, progress: Progress
+) -> RunReport:
+    """Reconstruct one stack into an EXR file and its picture, in any case; workers : for its tiles, None: threads."""
+    prepared, frame = Prepared(options.read_model()), Frame(stack, output, _made_from(stack, _common(options)))
+    return _made(frame, prepared, options, workers, progress)[0]
+
+
+def _made(
+    frame: Frame,
+    prepared: Prepared,
+    options: FrameOptions,
+    workers: Workers | None = None,
+    progress: Progress = no_progress,
+) -> tuple[RunReport, bool]:
     """Reconstruct a frame and write its files, the EXR file last: where it is, both are there."""
     stack = options.applied(stack_file.read(frame.stack), frame.stack)
     truth = result_files.truth_beside(frame.stack, stack)
     names = frame.stack, options.model
-    outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, prepared=prepared)
+    outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, workers, progress, prepared)
     report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
     clear_formats(frame.output)
     frame.output.unlink(missing_ok=True)

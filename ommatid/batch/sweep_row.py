@@ -10,14 +10,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict
 
 from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import read_record
 from ommatid.scenes.tables.toml import value_of
 
 NUMBERS = "sweep.json"
-GROUPS = ("budget", "seconds")  # in the files a key per part, such as `budget.rendering`
 
 
 class SweepRow(BaseModel):
@@ -27,10 +26,11 @@ class SweepRow(BaseModel):
     expected_mse, expected_low, expected_high : expectation given the true image, and its 99 % interval
     predicted_mse : Eq. 5;  rms, predicted_rms : roots of the mean squared errors, in grey levels
     gain : dB over the best single sub-image;  trusted : the verdict
+    Parts of the budget and seconds of the stages are further columns, `budget.rendering` and `seconds.render`.
     The order of the fields is that of the columns of sweep.csv.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="allow")
 
     scene: str
     folder: str | None = None
@@ -46,36 +46,16 @@ class SweepRow(BaseModel):
     psnr: float | None = None
     ssim: float | None = None
     gain: float | None = None
-    budget: dict[str, float] = Field(default_factory=dict[str, float])
     rank: int | None = None
     null_space: int | None = None
     condition: float | None = None
-    seconds: dict[str, float] = Field(default_factory=dict[str, float])
     measurements: int | None = None
     unknowns: int | None = None
     failed: str | None = None
 
-    @model_validator(mode="before")
-    @classmethod
-    def _grouped(cls, row: Any) -> Any:
-        """Collect `budget.*` and `seconds.*` of a row of the file."""
-        if not isinstance(row, dict):
-            return row
-        grouped: dict[str, Any] = {}
-        for name, value in row.items():  # pyright: ignore[reportUnknownVariableType]
-            group, dot, part = str(name).partition(".")  # pyright: ignore[reportUnknownArgumentType]
-            if dot and group in GROUPS:
-                grouped.setdefault(group, {})[part] = value
-            else:
-                grouped[name] = value
-        return grouped
-
     def flat(self) -> dict[str, Any]:
-        """The row as in the files: `budget.*` and `seconds.*` are keys of their own, None is left out."""
-        row: dict[str, Any] = {}
-        for name, value in self.model_dump(exclude_none=True).items():
-            row |= {f"{name}.{part}": number for part, number in value.items()} if name in GROUPS else {name: value}
-        return row
+        """The row as in the files: None is left out."""
+        return self.model_dump(exclude_none=True)
 
 
 def summary(document: Mapping[str, Any]) -> SweepRow:
@@ -102,8 +82,8 @@ def summary(document: Mapping[str, Any]) -> SweepRow:
         **where,
         **numbers,
         trusted=document.get("verdict", {}).get("trusted"),
-        budget=error.get("budget", {}),
-        seconds={name: value for name, value in seconds.items() if value is not None},
+        **{f"budget.{name}": part for name, part in error.get("budget", {}).items()},
+        **{f"seconds.{name}": value for name, value in seconds.items() if value is not None},
     )
 
 

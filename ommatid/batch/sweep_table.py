@@ -101,8 +101,9 @@ def _crossing_lines(rows: Sequence[SweepRow]) -> list[tuple[str, str]]:
 
 def _columns(rows: Sequence[SweepRow]) -> list[str]:
     """Columns of sweep.csv: scene, folder, the swept keys, then what at least one row has, in the fields' order."""
-    present = list(dict.fromkeys(name for row in rows for name in row.flat()))
-    columns = [name for field in SweepRow.model_fields for name in present if name.partition(".")[0] == field]
+    present = dict.fromkeys(name for row in rows for name in row.flat())
+    fields = SweepRow.model_fields
+    columns = [*(name for name in fields if name in present), *(name for name in present if name not in fields)]
     at = columns.index("values")
     return [*columns[:at], *rows[0].values, *columns[at + 1 :]]
 

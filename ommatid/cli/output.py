@@ -9,8 +9,7 @@ import json
 import os
 import sys
 from collections.abc import Generator, Iterable
-from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager, nullcontext, suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -99,12 +98,16 @@ def print_tables(sections: Iterable[Section]) -> None:
 
 
 class Bars:
-    """Bars with the time left on stderr, one below the other, where that is a terminal."""
+    """Bars with the time left on stderr, one below the other, where that is a terminal.
 
-    def __init__(self, quiet: bool = False) -> None:
-        """Create bars; quiet : True to show none."""
+    progress : takes the finished fraction of the scenes of a batch
+    """
+
+    def __init__(self, quiet: bool = False, alone: bool = False) -> None:
+        """Create bars; quiet : True to show and say nothing;  alone : True for a process that runs a single scene."""
+        from rich import progress as rich_progress
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TextColumn
+        from rich.progress import BarColumn, ProgressColumn, Task, TaskProgressColumn, TextColumn
         from rich.text import Text
 
         class TimeLeft(ProgressColumn):
@@ -117,10 +120,12 @@ class Bars:
                     "" if left is None else f"{timedelta(seconds=round(left))} left", style="progress.remaining"
                 )
 
+        self.progress: Progress = no_progress
+        self._quiet, self._alone = quiet, alone
         columns = (TextColumn("{task.description:11}"), BarColumn(), TaskProgressColumn(), TimeLeft())
         console = Console(stderr=True)
         disabled = quiet or not console.is_terminal
-        self._shown = Progress(
+        self._shown = rich_progress.Progress(
             *columns,
             console=console,
             transient=True,
@@ -149,6 +154,17 @@ class Bars:
         if self._shown.tasks:
             self._shown.start()
 
+    def observer(self, folder: Path) -> RunObserver:
+        """Create the observer that shows the progress of a scene in `folder`, and says which stages are done."""
+        from ommatid.batch.remote import RunObserver
+        from ommatid.runtime.machine import seconds_since_start
+
+        def done(stage: str, made: bool) -> None:
+            if not self._quiet:
+                say_done(stage, made, folder / FILE_OF_STAGE[stage] if stage in FILE_OF_STAGE else None)
+
+        return RunObserver(self.bar, done, seconds_since_start if self._alone else None)
+
 
 @contextmanager
 def progress_bar(stage: str, quiet: bool = False) -> Generator[Progress]:
@@ -157,43 +173,12 @@ def progress_bar(stage: str, quiet: bool = False) -> Generator[Progress]:
         yield progress
 
 
-@dataclass(frozen=True)
-class BatchBars:
-    """The bars of a batch: that of all scenes, if there are several, and that of a stage.
-
-    progress : takes the finished fraction of the scenes
-    """
-
-    bars: Bars
-    progress: Progress
-    alone: bool
-    quiet: bool
-
-    def hidden(self) -> AbstractContextManager[None]:
-        """Take the bars away while results are printed."""
-        return self.bars.hidden()
-
-    def observer(self, folder: Path) -> RunObserver:
-        """Create the observer that shows the progress of a scene in `folder`, and says which stages are done."""
-        from ommatid.batch.remote import RunObserver
-        from ommatid.runtime.machine import seconds_since_start
-
-        def done(stage: str, made: bool) -> None:
-            if not self.quiet:
-                say_done(stage, made, folder / FILE_OF_STAGE[stage] if stage in FILE_OF_STAGE else None)
-
-        return RunObserver(self.bars.bar, done, seconds_since_start if self.alone else None)
-
-
 @contextmanager
-def batch_bars(count: int, quiet: bool = False) -> Generator[BatchBars]:
+def batch_bars(count: int, quiet: bool = False) -> Generator[Bars]:
     """Show the progress of a batch of so many scenes; quiet : True to show and say nothing."""
-    bars = Bars(quiet)
-    if count == 1:
-        yield BatchBars(bars, no_progress, True, quiet)
-        return
-    with bars.bar(f"{count} scenes") as progress:
-        yield BatchBars(bars, progress, False, quiet)
+    bars = Bars(quiet, alone=count == 1)
+    with nullcontext(no_progress) if count == 1 else bars.bar(f"{count} scenes") as bars.progress:
+        yield bars
 
 
 def print_lines(lines: Iterable[str], *, alarm: bool = False) -> None:

@@ -149,7 +149,8 @@ def _reconstruct_one(
             report, made = reconstruction.reconstruct_folder(stack, common, file, progress, *pool)
         else:
             report, made = reconstruction.reconstruct_files(stack, common, file, progress, *pool), True
-    write_formats(file / "estimate.exr" if whole else file, common.formats)
+    if whole:
+        write_formats(file / "estimate.exr", common.formats)
     if figures != SCREEN_PNG:
         write_figures(file, figures)
     if detail != "verdict":
@@ -179,6 +180,7 @@ def _reconstruct_many(
     from ommatid.batch.frames import reconstruct_frames
     from ommatid.page.batch_index import check_index
     from ommatid.pipeline.reconstruction import finish_film
+    from ommatid.reconstruct.output.verdict_words import is_trusted
 
     if not stacks:
         missing = "name a stack before it" if common.model.suffix == ".npz" else "name its model, model.npz, after it"
@@ -187,59 +189,64 @@ def _reconstruct_many(
     described: dict[Path, DescribedFrame] = {}
     with output.progress_bar("reconstruct", quiet=detail == "verdict") as progress:
         for frame, work in reconstruct_frames(stacks, folder, common, workers, progress):
-            described[frame.stack] = _described(frame, work, strict, quiet=detail == "verdict")
+            described[frame.stack] = _described(frame, work, quiet=detail == "verdict")
     frames = [described[stack] for stack in stacks]
     index, shown = finish_film(folder, [(each.frame, each.report, each.failure) for each in frames], common)
     if detail != "verdict":
         output.say(f"film: {shown}; {index}" if shown else f"{index}: written")
     _print_frames(folder, frames, detail)
-    worst = max(frame.code for frame in frames)
+    doubted = strict and not all(each.report is None or is_trusted(each.report) for each in frames)
+    worst = max(failures.NOT_TRUSTED if doubted else 0, *(each.code for each in frames))
     if worst:
         raise failures.BatchError(worst)
 
 
 @dataclass(frozen=True)
 class DescribedFrame:
-    """A frame with its JSON object, its row, its exit code, and its report, or the reason of its failure."""
+    """A frame with its report, or the reason of its failure and the exit code."""
 
     frame: Frame
-    document: dict[str, Any]
-    row: tuple[str, str]
-    code: int
     report: RunReport | None
     failure: str = ""
+    code: int = 0
 
 
 def _print_frames(folder: Path, frames: Sequence[DescribedFrame], detail: output.Detail | None) -> None:
     from ommatid.reconstruct.output import facts
 
-    pairs = [(frame.row[0], frame.report) for frame in frames if frame.report is not None]
+    finished = [(each.frame.output.name, each.report) for each in frames if each.report is not None]
     if detail is None:
-        output.print_json([frame.document for frame in frames])
+        output.print_json([_document(each) for each in frames])
     elif detail == "verdict":
-        output.print_lines(facts.verdict_line(*pair) for pair in pairs)
+        output.print_lines(facts.verdict_line(*pair) for pair in finished)
     elif detail == "table":
-        output.print_tables((name, facts.rows(report)) for name, report in pairs)
+        output.print_tables((name, facts.rows(report)) for name, report in finished)
     else:
-        output.print_tables([(f"{len(frames)} frames: {folder}", [frame.row for frame in frames])])
+        rows = [
+            (each.frame.output.name, f"failed: {each.failure}")
+            if each.report is None
+            else facts.frame_row(each.frame.output.name, each.report)
+            for each in frames
+        ]
+        output.print_tables([(f"{len(frames)} frames: {folder}", rows)])
 
 
-def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], strict: bool, quiet: bool) -> DescribedFrame:
-    """Finish a frame, and return what is printed of it."""
-    from ommatid.reconstruct.output.facts import frame_row
-    from ommatid.reconstruct.output.verdict_words import is_trusted
+def _document(described: DescribedFrame) -> dict[str, Any]:
+    heading = {"file": str(described.frame.output), "stack": str(described.frame.stack)}
+    if described.report is None:
+        return {**heading, "error": described.failure, "exit_code": described.code}
+    return {**heading, **described.report.plain()}
 
-    name, heading = frame.output.name, {"file": str(frame.output), "stack": str(frame.stack)}
+
+def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], quiet: bool) -> DescribedFrame:
+    """Finish a frame, and say so."""
     try:
         report, made = work()
     except Exception as error:
-        code, reason = failures.report(error), printable_sentence(error)
-        document = {**heading, "error": reason, "exit_code": code}
-        return DescribedFrame(frame, document, (name, f"failed: {reason}"), code, None, reason)
+        return DescribedFrame(frame, None, printable_sentence(error), failures.report(error))
     if not quiet:
         output.say_done("reconstruct", made, frame.output)
-    code = failures.NOT_TRUSTED if strict and not is_trusted(report) else 0
-    return DescribedFrame(frame, {**heading, **report.plain()}, frame_row(name, report), code, report)
+    return DescribedFrame(frame, report)
 
 
 def report(

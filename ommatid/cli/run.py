@@ -70,7 +70,7 @@ def run(
 
 
 def _print_run(
-    detail: output.Detail | None, bars: output.BatchBars, member: Member, description: dict[str, Any]
+    detail: output.Detail | None, bars: output.Bars, member: Member, description: dict[str, Any]
 ) -> dict[str, Any]:
     """Print a finished scene, unless `detail` is None, and return its description."""
     from ommatid.pipeline.sections import run_sections

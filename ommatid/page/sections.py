@@ -112,13 +112,12 @@ def _held_out(run: Run) -> dict[str, Any]:
     report = run.report.held_out
     if report is None:
         return {"held_out": None}
-    rows = held_out.rows(report)
+    verdict = held_out.verdict(report)
     return {
         "held_out": report,
-        "held_out_words": f"{rows[0][1][:1].upper()}{rows[0][1][1:]}",
+        "held_out_words": f"{verdict[:1].upper()}{verdict[1:]}",
         "held_out_prior": held_out.prior_words(report.prior),
         "held_out_maps": held_out.lens_type_maps(report),
-        "held_out_table": tables.held_out(rows),
     }
 
 
@@ -128,8 +127,6 @@ def _time(run: Run, bench: BenchTable | None) -> dict[str, Any]:
         "curves": curves,
         "curve_words": curve_words,
         "stages": tables.stages(run),
-        "more_samples": tables.more_samples(run),
-        "time_limit": tables.time_limit(run),
     }
 
 

@@ -12,14 +12,13 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 from ommatid.analysis.baselines import missing_methods
-from ommatid.analysis.study import remove_study
 from ommatid.batch.film import cached_film
-from ommatid.batch.frames import Frame, FrameOptions
+from ommatid.batch.frames import Frame, FrameOptions, reconstruct_file
 from ommatid.batch.remote import SILENT
 from ommatid.page.batch_index import INDEX, cached_index, write_film_index
 from ommatid.reconstruct.output import result_files, run_json
-from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture, clear_formats
-from ommatid.reconstruct.output.result_files import Region, region_reports
+from ommatid.reconstruct.output.estimate_formats import check_formats, check_picture
+from ommatid.reconstruct.output.result_files import Region
 from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport
 from ommatid.reconstruct.restore import check_camera
 from ommatid.runtime.errors import InputError
@@ -64,7 +63,7 @@ def reconstruct_files(
     cluster: Cluster | None = None,
     workers: int | None = None,
 ) -> RunReport:
-    """Reconstruct a stack with a model, and write the estimate (OpenEXR) and its picture; the caller writes formats.
+    """Reconstruct a stack with a model, and write the estimate (OpenEXR), its picture and formats.
 
     Returns the content of run.json, with the means of the regions.
     Raises InputError for wrong files and options, and for other files in the way, MachineError for a full disk.
@@ -74,15 +73,9 @@ def reconstruct_files(
     check_output(output.with_suffix(".png"))
     check_picture(output)
     check_formats(output, options.formats)
-    recorded, calibrated = options.read(stack)
-    truth, names = result_files.truth_beside(stack, recorded), (stack, options.model)
+    options.read(stack)  # refuses wrong files before workers are started
     with _tile_workers(cluster, workers) as pool:
-        result, report = result_files.reconstruct(recorded, calibrated, truth, names, pool, progress)
-    report = report.with_changes(**region_reports(result, options.regions))
-    clear_formats(output)
-    result_files.write_estimate(output, result, result_files.record_of(report))
-    result_files.write_picture(output.with_suffix(".png"), result.estimate.reshape(result.shape))
-    return report
+        return reconstruct_file(stack, output, options, pool, progress)
 
 
 def reconstruct_folder(
@@ -150,9 +143,7 @@ def finish_folder(
     )
     report = _with_design(report, recorded.scene)
     earlier = earlier_report(folder, report.fingerprint)
-    if made:
-        remove_study(folder)
-    elif earlier is not None:  # of a run, which says more
+    if not made and earlier is not None:  # of a run, which says more
         report = earlier.of_stages()
     files = max(perf_counter() - begun - report.stages["reconstruct"].seconds, 0.0)
     results = StageResults(report, recorded, calibrated, made, files)

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ommatid.batch.batch import RENDERED, Member, check_files, clear_results, prepare
 from ommatid.batch.remote import RunObserver, Stages
@@ -30,9 +30,6 @@ from ommatid.simulate.render import cached_stack
 from ommatid.simulate.renderer.variant import check_transport_variant
 from ommatid.simulate.renderer.variant import choose as choose_variant
 from ommatid.simulate.validation import check_scene, check_scene_memory
-
-if TYPE_CHECKING:
-    from ommatid.analysis.study import StudyFile
 
 
 @dataclass(frozen=True)
@@ -178,7 +175,6 @@ def check_render(setup: Setup, folder: Path) -> None:
 @one_thread()
 def results(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
     """Execute all stages of a scene but write neither its page nor run.json."""
-    from ommatid.analysis import study
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.reconstruct.output.result_files import cached_results
 
@@ -199,10 +195,7 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
 
         report = report.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
-        studied = _studied(setup, stack, folder, observer)
-        report = report.with_changes(study=studied.cases).with_stage("study", studied.seconds)
-    else:
-        study.remove_study(folder)
+        report = _with_study(report, setup, stack, folder, observer)
     return StageResults(report, stack, model, made, max(files, 0.0), start_up)
 
 
@@ -319,14 +312,20 @@ def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> tuple[Stack,
     return stack, made
 
 
-def _studied(setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> StudyFile:
-    """Reconstruct the stack with every model of H that the scene's study names."""
+def _with_study(report: RunReport, setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> RunReport:
+    """Add the errors with every model of H that the scene's study names, from run.json if they are up to date."""
     from ommatid.analysis.calibration_goal import for_stack
-    from ommatid.analysis.study import cached_study, study_models
+    from ommatid.analysis.study import study_cases, study_models
     from ommatid.reconstruct.output.result_files import truth_beside
 
-    with observer.progress("study") as progress:
-        known = study_models(setup, folder, no_progress, for_stack(stack))
-        studied, made = cached_study(folder, stack, known, truth_beside(folder / "stack.exr", stack), progress)
+    known, begun = earlier_report(folder, report.fingerprint), perf_counter()
+    models = study_models(setup, folder, no_progress, for_stack(stack))
+    made = known is None or [case.model for case in known.study] != list(models)
+    if known is None or made:
+        with observer.progress("study") as progress:
+            cases = study_cases(stack, models, truth_beside(folder / "stack.exr", stack), progress)
+        seconds = perf_counter() - begun
+    else:
+        cases, seconds = known.study, known.stages["study"].seconds
     observer.done("study", made)
-    return studied
+    return report.with_changes(study=cases).with_stage("study", seconds)

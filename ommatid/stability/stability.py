@@ -10,7 +10,7 @@ errors of all cases with their bounds: points above the dotted line, at ten time
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, fields
 from math import log10
 from pathlib import Path
@@ -23,7 +23,7 @@ from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import write_csv, write_text
+from ommatid.runtime.files import write_csv
 from ommatid.runtime.outputs.occupied import occupied
 
 from .cases import Matrices, StabilityCase, extreme_cases, noise_sweep
@@ -203,17 +203,16 @@ def run(matrices: Matrices, progress: Callable[[float], None]) -> Results:
 def write_stability(
     folder: Path, matrices: Matrices, progress: Callable[[float], None], figures: FigureFiles = SCREEN_PNG
 ) -> dict[str, Any]:
-    """Write stability.csv, stability.md and stability.png; return a summary. Raises InputError or MachineError."""
+    """Write stability.csv and stability.png; return a summary. Raises InputError or MachineError."""
     with occupied(folder):
         results = run(matrices, progress)
         outcomes = [outcome for _, outcome in results]
         columns = [field.name for field in fields(StabilityOutcome)]
         write_csv(folder / "stability.csv", columns, (astuple(outcome) for outcome in outcomes))
-        write_text(folder / "stability.md", markdown(outcomes))
         write_figure(folder / "stability.png", results, figures)
     verdicts = [outcome.verdict for outcome in outcomes]
     return {
-        "files": [str(folder / name) for name in ("stability.csv", "stability.md", "stability.png")],
+        "files": [str(folder / name) for name in ("stability.csv", "stability.png")],
         "verdicts": {verdict: verdicts.count(verdict) for verdict in (RIGHT, REFUSED, FEWER, SILENT)},
         "cases": [asdict(outcome) for outcome in outcomes],
     }
@@ -228,25 +227,5 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         lines.append((name, f"{worst[field]:.1f}: {worst['case']}, {worst['form']}"))
     refused = [case["case"] for case in summary["cases"] if case["verdict"] == REFUSED]
     if refused:
-        lines.append(("refused, for the reason in stability.md", "; ".join(refused)))
+        lines.append(("refused, for the reason in stability.csv", "; ".join(refused)))
     return [*lines, ("files", ", ".join(summary["files"]))]
-
-
-def markdown(outcomes: Iterable[StabilityOutcome]) -> str:
-    """Return a table of cases with the form that ran and its correct digits."""
-    lines = [
-        "# Stiff and extreme cases",
-        "",
-        "Correct digits against the exact answer, of 16 in float64. Bounds are relative.",
-        "",
-        "| case | measurements x unknowns | form | digits of the estimate | of the worst variance | bound | verdict |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for outcome in outcomes:
-        start = f"| {outcome.case} | {outcome.measurements} x {outcome.unknowns}"
-        if outcome.refined is None or outcome.variance is None or outcome.bound is None:
-            lines.append(f"{start} | | | | | refused: {outcome.reason} |")
-        else:
-            figures = f"{outcome.refined:.1f} | {outcome.variance:.1f} | {outcome.bound:.0e}"
-            lines.append(f"{start} | {outcome.form} | {figures} | {outcome.verdict} |")
-    return "\n".join(lines) + "\n"

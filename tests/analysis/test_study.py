@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,7 +22,6 @@ from ommatid.scenes.formats.picture import load
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.stack import Stack
-from ommatid.scenes.tables.estimation import StudyModel
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 
 from ..conftest import Command
@@ -120,27 +118,12 @@ def test_an_impossible_study_is_refused_before_it_starts() -> None:
             study.check_study(described, derive(described))
 
 
-def test_a_study_is_cached_and_printed(tmp_path: Path) -> None:
+def test_a_study_says_which_errors_are_inside_their_intervals() -> None:
     stack, model, truth = recorded(misaligned())
-    made: list[str] = []
-
-    def give(name: str) -> Model:
-        made.append(name)
-        return model if name != "true" else exact_model(stack.scene, stack.camera, true_matrix(stack.camera), "true")
-
-    models: dict[StudyModel, Callable[[], Model]] = {"ideal": lambda: give("ideal"), "true": lambda: give("true")}
-    studied, fresh = study.cached_study(tmp_path, stack, models, truth)
-    assert (fresh, made) == (True, ["ideal", "true"])
-    assert study.cached_study(tmp_path, stack, models, truth) == (studied, False)
-    assert len(made) == 2, "no model is made again"
-    rows = dict(study.rows(studied.cases))
+    true = exact_model(stack.scene, stack.camera, true_matrix(stack.camera), "true")
+    rows = dict(study.rows(study.study_cases(stack, {"ideal": lambda: model, "true": lambda: true}, truth)))
     assert "OUTSIDE" in rows["the ideal H"]
     assert "inside" in rows["the true H"]
-    table = (tmp_path / "study.csv").read_text(encoding="utf-8").splitlines()
-    assert table[0].startswith("model,mse,predicted")
-    assert [line.split(",")[0] for line in table[1:]] == ["ideal", "true"]
-    other = replace(stack, scene=misaligned(noise={"variance": 2e-2}))
-    assert study.cached_study(tmp_path, other, models, truth)[1]
 
 
 @pytest.mark.slow

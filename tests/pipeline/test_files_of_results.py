@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import tifffile
 
-from ommatid.analysis import study
 from ommatid.batch.remote import RunObserver, carry_out, packed, unpack
 from ommatid.batch.sweep_row import read_rows
 from ommatid.reconstruct.output import result_files, run_json
@@ -25,7 +24,6 @@ from ..conftest import TINY, Command
 RUN = ("run", "tiny.toml", "-o", "out", "-q")
 CHANGED = ("--set", "prior.mean=100")
 FORMATS = {"estimate.npy", "estimate.tiff"}
-STUDY = {study.NUMBERS, study.TABLE}
 
 
 def names(folder: Path) -> set[str]:
@@ -37,21 +35,20 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def write_old(folder: Path) -> None:
-    for name in FORMATS | STUDY:
+    for name in FORMATS:
         (folder / name).write_text("of an earlier run", encoding="utf-8")
 
 
 # --- a new result
 
 
-def test_a_new_result_removes_the_formats_and_the_study_of_the_old_one(kept: Path, ommatid: Command) -> None:
+def test_a_new_result_removes_the_formats_of_the_old_one(kept: Path, ommatid: Command) -> None:
     write_old(kept)
     assert ommatid(*RUN).code == 0
     assert names(kept) >= FORMATS, "the result is up to date, and so are they"
-    assert not names(kept) & STUDY
     write_old(kept)
     assert ommatid(*RUN, *CHANGED).code == 0
-    assert not names(kept) & (FORMATS | STUDY)
+    assert not names(kept) & FORMATS
 
 
 def test_a_reconstruction_removes_what_an_earlier_run_left_in_its_folder(
@@ -60,7 +57,7 @@ def test_a_reconstruction_removes_what_an_earlier_run_left_in_its_folder(
     command = "reconstruct", finished / "stack.exr", finished / "model.npz", "-o", kept, "-q"
     write_old(kept)
     assert ommatid(*command, *CHANGED).code == 0
-    assert not names(kept) & (FORMATS | STUDY | {"scene.toml"})
+    assert not names(kept) & (FORMATS | {"scene.toml"})
     (kept / "scene.toml").write_text(TINY, encoding="utf-8")
     assert ommatid(*command).code == 0
     assert (kept / "scene.toml").read_text(encoding="utf-8") == TINY, "a scene that no run wrote stays"

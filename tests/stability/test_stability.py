@@ -187,10 +187,7 @@ def test_the_files_hold_every_case(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         lines = list(csv.DictReader(stream))
     assert len(lines) == 4 + 3
     assert summary["verdicts"] == {RIGHT: 5, REFUSED: 2, FEWER: 0, SILENT: 0}
-    table = (tmp_path / "stability.md").read_text(encoding="utf-8")
-    assert table.count("\n|") == 2 + 4 + 3
-    assert EXTREMES[-1].name in table
+    assert EXTREMES[-1].name in [line["case"] for line in lines]
     assert (tmp_path / "stability.png").stat().st_size > 20_000
     assert progress[-1] == 1.0
-    assert EXTREMES[-1].name in dict(stability.rows(summary))["refused, for the reason in stability.md"]
-    assert stability.markdown([]).startswith("# Stiff")
+    assert EXTREMES[-1].name in dict(stability.rows(summary))["refused, for the reason in stability.csv"]

@@ -28,7 +28,7 @@ METHODS = {
     "total_variation": "total variation",
 }  # of `--baselines`
 
-Topic = Literal["verdict", "error", "quality", "limit", "time", "region"]
+Topic = Literal["verdict", "error", "quality", "limit", "time", "stage", "region"]
 LINES: tuple[Topic, ...] = "error", "quality", "limit", "time"  # of a summary, below the verdict
 
 
@@ -210,15 +210,15 @@ def _verdict(report: RunReport) -> list[Fact]:
 def _stages(report: RunReport) -> list[Fact]:
     found: list[Fact] = []
     for name, stage in report.stages.items():
-        details = [] if stage.samples is None else [samples_of(stage)]
-        details += [] if stage.variant is None else [stage.variant]
+        details = [] if stage.method in (None, "imported") else [str(stage.method)]
+        details += [] if stage.samples is None else [samples_of(stage)]
+        details += [each for each in (stage.sampler, stage.variant) if each is not None]
         if name == "reconstruct":
             details.append(f"{_method(report.solver)}, {report.unknowns} unknowns")
-        found.append(
-            Fact("import" if stage.method == "imported" else name, f"{stage.seconds:.2f} s", ", ".join(details))
-        )
+        named = "import" if stage.method == "imported" else name
+        found.append(Fact(named, f"{stage.seconds:.2f} s", ", ".join(details), "stage"))
     if report.spent.start_up is not None:
-        found.append(Fact("start-up", f"{report.spent.start_up:.2f} s"))
+        found.append(Fact("start-up", f"{report.spent.start_up:.2f} s", topic="stage"))
     return found
 
 
@@ -333,8 +333,13 @@ def _time(report: RunReport) -> list[Fact]:
     found = [Fact("time", f"{report.seconds:.1f} s", stages, "time")]
     if spent.within is not None:
         chosen = ", ".join(f"{key} {value}" for key, value in spent.chosen.items())
-        found.append(Fact("  of the time limit", f"{spent.seconds or 0.0:.1f} s of {spent.within:g} s", chosen))
+        limit = f"{spent.seconds or 0.0:.1f} s of {spent.within:g} s, all trials together"
+        found.append(Fact("  of the time limit", limit, chosen, "stage"))
     if more and is_trusted(report):
-        words = ", ".join(f"{each.predicted_mse:.4g} in {each.seconds:.3g} s" for each in more[:2])
-        found.append(Fact("MSE with more samples", f"at most {words}", f"by noise alone {report.noise_alone:.4g}"))
+        found += [
+            Fact(f"MSE with {each.times} times the samples", f"at most {each.predicted_mse:.4g}", time, "stage")
+            for each in more
+            for time in [f"in {each.seconds:.3g} s"]
+        ]
+        found.append(Fact("MSE with noise alone", f"{report.noise_alone:.4g}", topic="stage"))
     return found

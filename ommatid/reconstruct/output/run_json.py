@@ -496,10 +496,15 @@ class RunReport(Record):
         parts = sum(self.error.budget.get(part, 0.0) for part in STAGES.values())
         total = sum(stage.seconds for stage in self._computing.values())
         growing = render.seconds + (calibrate.seconds if calibrate.method != "ideal" else 0.0)
-        fall = INDEPENDENT if render.sampler == "independent" else STRATIFIED
         return tuple(
-            MoreTime(times, total + (times - 1) * growing, self.noise_alone + parts * times**-fall) for times in MORE
+            MoreTime(times, total + (times - 1) * growing, self.noise_alone + parts * times**-self.fall)
+            for times in MORE
         )
+
+    @property
+    def fall(self) -> float:
+        """The exponent with which the parts of rendering and calibration fall with their samples."""
+        return INDEPENDENT if self.stages["render"].sampler == "independent" else STRATIFIED
 
     @property
     def _computing(self) -> dict[str, StageReport]:

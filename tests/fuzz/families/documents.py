@@ -31,15 +31,12 @@ NUMBERS = ("1" + "0" * 5000, "-" + "9" * 5000, "1e400", "-1e400", "NaN", "Infini
 
 
 def add_documents(folder: Path) -> None:
-    """Add a sweep, a bench and a study to the results in a folder."""
+    """Add a sweep and a bench to the results in a folder."""
     report = json.loads((folder / RUN / "run.json").read_bytes())
     row = SweepRow(scene=SCENE, folder=Path(RUN).name, values={"noise.variance": "1e-2"}, mse=1.0, predicted_mse=2.0)
     write_rows(folder / "out/sweep.json", [row, row.model_copy(update={"mse": report["error"].get("mse")})])
     table = bench_table(derive(read(folder / SCENE)), [cell(), cell("calibrate"), cell("reconstruct", samples=None)])
     (folder / RUN / "bench.json").write_text(json.dumps(table.describe()), encoding="ascii")
-    study = {"fingerprint": "0" * 64, "cases": []}
-    (folder / RUN / "study.json").write_text(json.dumps(study), encoding="ascii")
-    (folder / RUN / "study.csv").write_text("model\n", encoding="ascii")
 
 
 def json_damaged(rng: Random, original: bytes) -> bytes:
@@ -130,9 +127,6 @@ DOCUMENTS = (
         ("run", SCENE, "-o", "out", "--within", "1 h", "--dry-run"),
     ),
     beside("sweep.json", "out/sweep.json", json_damaged, REPORT_ALL),
-    beside(
-        "study.json", f"{RUN}/study.json", json_damaged, (*AGAIN, "--set", 'study.models=["ideal"]', "-q"), share=0.2
-    ),
     beside("report.html", f"{RUN}/report.html", text_damaged, REPORT, share=0.2),
     beside("scene.toml", f"{RUN}/scene.toml", text_damaged, REPORT, AGAIN, share=0.2),
     beside("interrupted rendering", PARTIAL, archive_damaged, ("render", SCENE, "-o", "out", "--force"), share=0.2),

@@ -35,6 +35,7 @@ from ommatid.reconstruct.measured_error import (
 )
 from ommatid.reconstruct.methods.method import total_variance
 from ommatid.reconstruct.noise import known_noise, usable_pixels
+from ommatid.reconstruct.output.result_files import BASELINES
 from ommatid.reconstruct.output.run_json import BaselineMethod, MethodReport
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.files import cached
@@ -47,7 +48,6 @@ from ommatid.scenes.model import Model
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
-BASELINES = "baselines.exr"
 LARGEST = 2**18  # pixels of f up to which total variation takes minutes
 UNREADABLE = OSError, ValueError, KeyError, TypeError  # reading what is missing or of another program
 HALF = 1e-6  # of a pixel, within which a position lies halfway between two
@@ -101,13 +101,6 @@ def known_baselines(folder: Path, fingerprint: str) -> Baselines | None:
         found, made_from = _read(folder / BASELINES)
         return found if made_from == fingerprint else None
     return None
-
-
-def remove_other_baselines(folder: Path, fingerprint: str) -> None:
-    """Remove the baselines of results with another fingerprint from a folder; a file of another program stays."""
-    with suppress(*UNREADABLE):
-        if _read(folder / BASELINES)[1] != fingerprint:
-            (folder / BASELINES).unlink()
 
 
 def _read(path: Path) -> tuple[Baselines, str | None]:

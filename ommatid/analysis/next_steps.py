@@ -15,14 +15,7 @@ from fractions import Fraction
 import numpy as np
 
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.output.verdict_words import (
-    CHANGES,
-    LEAST_GAIN,
-    SAMPLES,
-    TIMES,
-    follows_samples,
-    is_trusted,
-)
+from ommatid.reconstruct.output.verdict_words import LEAST_GAIN, NextStep, is_trusted, steps_of
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import one_thread
 from ommatid.scenes.camera import derive
@@ -33,34 +26,17 @@ from .averaging_kernel import ErrorWindow, posterior_covariance
 from .design import with_lens
 
 
-@dataclass(frozen=True)
-class NextStep:
-    """A change, how to make it, and the mean squared error with it.
-
-    is_bound : True if the error is at most `mse`;  seconds : of the run with the change, None if not known
-    """
-
-    change: str
-    how: str
-    mse: float
-    is_bound: bool = False
-    seconds: float | None = None
-
-
 def next_steps(report: RunReport, other: AnotherType | None = None) -> list[NextStep]:
     """Return the changes that reduce the error by a twentieth or more, the best first; none for a run without trust."""
-    now, budget = report.error.predicted_mse, report.error.budget
+    now = report.error.predicted_mse
     if not is_trusted(report) or now <= 0:
         return []
-    steps = [_samples(report)] if report.more_samples and follows_samples(report) else []
-    for name, (words, how, factor) in CHANGES.items():
-        part = budget.get(name, 0.0)
-        steps.append(NextStep(words, how, now - (1 - factor) * part, is_bound=True))
+    steps = steps_of(report)
     if other is not None:
         how = f"{other.measurements} measurements more; `ommatid design` chooses among all"
         words = f"another lens type, of magnification {other.magnification} on the pixel grid"
         steps.append(NextStep(words, how, _with_other_type(report, other)))
-    useful = [step for step in steps if step is not None and step.mse <= (1 - LEAST_GAIN) * now]
+    useful = [step for step in steps if step.mse <= (1 - LEAST_GAIN) * now]
     return sorted(useful, key=lambda step: step.mse)
 
 
@@ -68,15 +44,6 @@ def _with_other_type(report: RunReport, other: AnotherType) -> float:
     """Return the error with another type, which changes nothing of detail finer than f."""
     fixed = report.error.budget.get("detail", 0.0)
     return fixed + other.ratio * (report.error.predicted_mse - fixed)
-
-
-def _samples(report: RunReport) -> NextStep | None:
-    more = next(more for more in report.more_samples if more.times == TIMES)
-    parts = {name: report.error.budget.get(name, 0.0) for name in SAMPLES}
-    keys = " and ".join(key for name, key in SAMPLES.items() if parts[name])
-    if not keys:
-        return None
-    return NextStep(f"{more.times} times the samples", keys, more.predicted_mse, seconds=more.seconds)
 
 
 CANDIDATES = tuple(Fraction(1, number) for number in range(2, 9))

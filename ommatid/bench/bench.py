@@ -37,61 +37,67 @@ def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tup
     """
     _check_flat(setup.scene)
     check_folder(folder)
-    with occupied(folder, JSON, lock=LOCK):
-        return _bench(setup, folder, seconds, progress)
-
-
-def _bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tuple[BenchTable, bool]:
-    start = perf_counter()
     setup = replace(setup, scene=_with_exact_assumptions(setup.scene), given_image=setup.image)
-    scene, camera = setup.scene, setup.camera
-    check_scene(setup, calibrates=False)
-    subject_print = _fingerprint(setup)
-    made_from = fingerprint([subject_print, versions("mitsuba", "drjit", "scipy")])
-    previous = _previous(folder, subject_print)
-    if previous is not None and previous.fingerprint != made_from:
-        previous = None
-    if previous is not None and previous.budget > 0:  # one that was not interrupted
-        late = any(job.late for job in previous.left_out)
-        if previous.budget >= seconds or not late:
+    with occupied(folder, JSON, lock=LOCK):
+        check_scene(setup, calibrates=False)
+        previous = _previous(folder, _fingerprint(setup))
+        if previous is not None and _is_complete(previous, seconds):
             return previous, False
-    spent_before = 0.0 if previous is None else previous.seconds
-    start -= spent_before
-    with naming_source(scene.source):
-        right = reference(setup)
-        subject = Subject(setup, right)
+        return _measured(setup, folder, seconds, previous, progress), True
+
+
+def _measured(
+    setup: Setup, folder: Path, seconds: float, previous: BenchTable | None, progress: Progress
+) -> BenchTable:
+    """Measure the cells that `previous` lacks, and write table and figures."""
+    start = perf_counter() - (0.0 if previous is None else previous.seconds)
+    with naming_source(setup.scene.source):
+        subject = Subject(setup, reference(setup))
         listed, never = jobs(subject)
-    system = os.uname().sysname, os.uname().release, os.uname().machine  # `platform` runs the command uname
 
     def table(cells: Sequence[Cell], left_out: Sequence[SkippedJob], budget: float) -> BenchTable:
-        return BenchTable(
-            title=scene.title or scene.source.stem,
-            scene=subject_print,
-            fingerprint=made_from,
-            camera=camera.describe(),
-            machine={"cores": os.cpu_count(), "system": " ".join(system), "load": os.getloadavg()[0]},
-            versions=versions("mitsuba", "drjit", "scipy"),
-            against=right.description,
-            noise_deviation=subject.noise_deviation,
-            budget=budget,
-            seconds=perf_counter() - start,
-            cells=tuple(cells),
-            curves=tuple(curves(cells, camera)),
-            recommended=recommend(cells, subject.noise_floor),
-            left_out=(*never, *left_out),
-        )
+        return _table(subject, cells, (*never, *left_out), budget, perf_counter() - start)
 
     def save(cells: Sequence[Cell]) -> None:
         bench_file.write(folder, table(cells, (), 0.0))
         progress(min(1.0, (perf_counter() - start) / seconds))
 
     known = {} if previous is None else {name_of(cell): cell for cell in previous.cells}
-    cells, left_out = measure(listed, known, start + seconds, save)
-    complete = table(cells, left_out, seconds)
+    complete = table(*measure(listed, known, start + seconds, save), seconds)
     write_figures(folder, complete)
     bench_file.write(folder, complete)
     progress(1.0)
-    return complete, True
+    return complete
+
+
+def _table(
+    subject: Subject, cells: Sequence[Cell], left_out: tuple[SkippedJob, ...], budget: float, seconds: float
+) -> BenchTable:
+    """Return the table of cells; budget : 0 while they are measured."""
+    scene, made_of = subject.scene, _fingerprint(subject.setup)
+    system = os.uname().sysname, os.uname().release, os.uname().machine  # `platform` runs the command uname
+    return BenchTable(
+        title=scene.title or scene.source.stem,
+        scene=made_of,
+        fingerprint=_made_from(made_of),
+        camera=subject.camera.describe(),
+        machine={"cores": os.cpu_count(), "system": " ".join(system), "load": os.getloadavg()[0]},
+        versions=versions("mitsuba", "drjit", "scipy"),
+        against=subject.reference.description,
+        noise_deviation=subject.noise_deviation,
+        budget=budget,
+        seconds=seconds,
+        cells=tuple(cells),
+        curves=tuple(curves(cells, subject.camera)),
+        recommended=recommend(cells, subject.noise_floor),
+        left_out=left_out,
+    )
+
+
+def _is_complete(previous: BenchTable, seconds: float) -> bool:
+    """Return True unless a bench was interrupted, or left out cells that fit into more time."""
+    late = any(job.late for job in previous.left_out)
+    return previous.budget > 0 and (previous.budget >= seconds or not late)
 
 
 def measure(
@@ -166,7 +172,11 @@ def _previous(folder: Path, subject_print: str) -> BenchTable | None:
             f"{path}: is of another scene, '{previous.title}', or of other values of its keys; choose another folder"
             " with -o"
         )
-    return previous
+    return previous if previous.fingerprint == _made_from(subject_print) else None
+
+
+def _made_from(subject_print: str) -> str:
+    return fingerprint([subject_print, versions("mitsuba", "drjit", "scipy")])
 
 
 def rows(table: BenchTable) -> list[tuple[str, str]]:

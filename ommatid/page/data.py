@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ommatid.analysis.baselines import known_baselines
 from ommatid.reconstruct.measured_error import best_single_sub_image, enlarged
 from ommatid.reconstruct.output import run_json
+from ommatid.reconstruct.output.overview import sub_image_of
 from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.arrays import Float32Array, FloatArray
@@ -175,11 +176,5 @@ def shown_sub_image(stack: Stack, truth: FloatArray | None) -> ShownSubImage:
     best = best_single_sub_image(stack, truth)
     if best is not None:
         return ShownSubImage(best.name, best.image, True)
-    camera = stack.camera
-    index = min(range(len(camera.types)), key=lambda index: camera.types[index].ratio)
-    lens_type = camera.types[index]
-    k, l = (count // 2 for count in lens_type.array)  # noqa: E741
-    part = camera.type_slices()[index].start + (k * lens_type.array[1] + l) * lens_type.pixels[0] * lens_type.pixels[1]
-    size = lens_type.pixels[0] * lens_type.pixels[1]
-    sub, pixels = camera.sub_imager(index, k, l), stack.values[part : part + size].reshape(lens_type.pixels)
+    camera, (sub, pixels) = stack.camera, sub_image_of(stack)
     return ShownSubImage(sub.name, enlarged(camera, sub, pixels, np.arange(float(camera.rows))), False)

@@ -70,9 +70,7 @@ def _head(run: Run) -> dict[str, Any]:
         "sentence": words.sentence(report),
         "reasons": words.reasons(report),
         "grounds": words.grounds(report),
-        "notes": words.notes(report),
-        "cautions": words.cautions(report),
-        "assumptions": words.assumptions(report),
+        "cautions": facts.on_topic(report, "caution"),
         "key_numbers": facts.on_topic(report, "error", "quality", "time"),
     }
 

@@ -32,37 +32,16 @@ def reasons(report: RunReport) -> list[str]:
 
 
 def grounds(report: RunReport) -> list[str]:
-    """Return what the verdict of a result that can be trusted rests on, one sentence for each passed check."""
-    if not is_trusted(report):
-        return []
-    return [_sentence(words) for words in report.verdict.passed or (verdict_words.grounds(report),)]
-
-
-def notes(report: RunReport) -> list[str]:
-    """Return the notes of the verdict as sentences."""
-    return [_sentence(words) for words in report.verdict.notes]
+    """Return what the verdict rests on: passed checks of a result that can be trusted, notes, and assumptions."""
+    verdict, found = report.verdict, list[str]()
+    if is_trusted(report):
+        found += verdict.passed or (verdict_words.grounds(report),)
+    found += verdict.notes
+    return [_sentence(words) for words in (*found, *(f"assumed: {each}" for each in report.assumes))]
 
 
 def _sentence(words: str) -> str:
     return f"{words[:1].upper()}{words[1:]}."
-
-
-def cautions(report: RunReport) -> list[str]:
-    """Return warnings that a reader needs before the numbers, one sentence each."""
-    warnings: list[str] = []
-    diagnostics = report.diagnostics
-    if diagnostics.pixels_dead:
-        warnings.append(f"{diagnostics.pixels_dead} dead sensor pixels are excluded from the estimate.")
-    if diagnostics.pixels_saturated:
-        warnings.append(
-            f"{diagnostics.pixels_saturated} saturated sensor pixels count as readings of at least the limit."
-        )
-    return warnings
-
-
-def assumptions(report: RunReport) -> list[str]:
-    """Return what the run assumed, one sentence each."""
-    return [f"Assumed: {assumption}." for assumption in report.assumes]
 
 
 def numbers_beside(report: RunReport) -> dict[str, str]:

@@ -71,15 +71,23 @@ def prove_best_camera(
             point for bits, each in found.items() for point in step(design_report.front(each.space, bits, each.budget))
         ]
         make_folder(folder)
-        files = dict[tuple[int | None, str], str]()
-        for number, (each, camera) in enumerate(zip(best.whole, made, strict=True), 1):
-            if camera is not None:
-                files[chosen, words_of(each.counts, best.space)] = f"camera{number}.toml"
-                write(folder / f"camera{number}.toml", camera)
+        files = _write_cameras(folder, best, made, chosen)
         design_report.write_front(folder / "front.csv", points, [_file(folder, point, files) for point in points])
         design_report.draw_front(folder / "front.png", points, best, figures)
     progress(1.0)
     return {"bits": chosen, **design_report.describe(best, with_edges)}, lines
+
+
+def _write_cameras(
+    folder: Path, best: BestCamera, cameras: Iterable[Scene | None], bits: int | None
+) -> dict[tuple[int | None, str], str]:
+    """Write the scene files of the best cameras, and return their names by bits and lens types."""
+    files = dict[tuple[int | None, str], str]()
+    for number, (each, camera) in enumerate(zip(best.whole, cameras, strict=True), 1):
+        if camera is not None:
+            files[bits, words_of(each.counts, best.space)] = f"camera{number}.toml"
+            write(folder / f"camera{number}.toml", camera)
+    return files
 
 
 @dataclass

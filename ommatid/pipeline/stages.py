@@ -201,11 +201,11 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
 
 def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunReport:
     """Write the page and run.json of results, and return its content. Where nothing was made, earlier times stay."""
-    begun = perf_counter()
-    results = _with_known_baselines(results, folder)
+    begun, earlier = perf_counter(), earlier_report(folder, results.report.fingerprint)
+    if earlier is not None:
+        results = replace(results, report=results.report.with_changes(baselines=earlier.baselines))
     write_page(results, folder, observer)
     times = results.files, perf_counter() - begun, results.start_up
-    earlier = earlier_report(folder, results.report.fingerprint)
     if earlier is not None and not results.made:
         files, page = (earlier.stages[name].seconds if name in earlier.stages else 0.0 for name in (FILES, PAGE))
         times = files, page, earlier.spent.start_up
@@ -213,17 +213,6 @@ def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunRep
     if earlier is None or report.plain() != earlier.plain():
         run_json.write(folder, report)
     return report
-
-
-def _with_known_baselines(results: StageResults, folder: Path) -> StageResults:
-    """Return results with the baselines in the folder, from which those of other results are removed."""
-    from ommatid.analysis.baselines import known_baselines, remove_other_baselines
-
-    known = known_baselines(folder, results.report.fingerprint)
-    if known is None:
-        remove_other_baselines(folder, results.report.fingerprint)
-        return results
-    return replace(results, report=results.report.with_changes(baselines=known.reports))
 
 
 def earlier_report(folder: Path, fingerprint: str) -> RunReport | None:

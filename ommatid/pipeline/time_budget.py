@@ -99,8 +99,7 @@ def run_within(
     requested = RequestedTime(seconds=seconds, scenes=1) if request is None else request
     earlier = _earlier_run(folder, setup, requested)
     if earlier is not None:
-        chosen = (earlier.chosen[key] for key in KEYS)
-        results = stages.results(_with_samples(setup, *chosen), folder, observer)
+        results = stages.results(_with_samples(setup, *_samples_of(earlier)), folder, observer)
         same = earlier.model_dump(include={"within", "asked", "seconds", "chosen"})
         return _finish(results, folder, observer, TimeReport.model_validate(same))
 
@@ -122,7 +121,7 @@ def run_within(
         fewest = ", the fewest possible" if samples == (FEW, FEW) else ""
         counts = f"{samples[0]} and {samples[1]} samples per pixel{fewest}"
         say(f"{folder}: took {total:.1f} s of {seconds:g} s with {counts}")
-    chosen = dict(zip(KEYS, samples, strict=True))
+    chosen: dict[str, Samples] = dict(zip(KEYS, samples, strict=True))
     spent = {"within": seconds, "asked": requested, "seconds": total, "chosen": chosen}
     return _finish(results, folder, observer, TimeReport.model_validate(spent))
 
@@ -183,6 +182,10 @@ def _with_samples(setup: Setup, rendering: Samples, calibration: Samples) -> Set
     return replace(setup, scene=with_tables(setup.scene, render=render, calibration=calibrate))
 
 
+def _samples_of(spent: TimeReport) -> tuple[Samples, Samples]:
+    return spent.chosen[KEYS[0]], spent.chosen[KEYS[1]]
+
+
 def _page_seconds(results: StageResults, folder: Path, observer: RunObserver, clock: Clock) -> float:
     """Write the page of the present results, and return the seconds that it took, as the final one will."""
     start = clock()
@@ -194,7 +197,7 @@ def _earlier_run(folder: Path, setup: Setup, requested: RequestedTime) -> TimeRe
     """Return the times of the run in `folder` if it was of the same scene with the same request."""
     try:
         earlier = run_json.read(folder).spent
-        scene = _with_samples(setup, *(earlier.chosen[key] for key in KEYS)).resolved.plain()
+        scene = _with_samples(setup, *_samples_of(earlier)).resolved.plain()
         same_scene = toml.loads(read_text(folder / "scene.toml")) == scene
     except (InputError, OSError, ValueError, KeyError):
         return None

@@ -135,7 +135,7 @@ def test_steps_are_ranked_by_their_gain_and_small_ones_left_out() -> None:
     sampled = changed.with_changes(error=by_samples)
     assert "; four times the samples (`render.samples`): RMS" in limit(sampled)
     steps = next_steps(changed)
-    assert [step.change for step in steps] == ["4 times the samples", "half the noise variance"]
+    assert [step.change for step in steps] == ["four times the samples", "half the noise variance"]
     assert (steps[0].mse, steps[0].seconds) == (pytest.approx((0.56 + 0.44 / 4) * now), 1.75 + 3 * 1.5)
     assert steps[0].how == "`render.samples` and `calibration.samples`"
     assert steps[1].mse == pytest.approx(0.75 * now)

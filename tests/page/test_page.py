@@ -215,7 +215,7 @@ def test_a_letter_is_upright_in_the_maps(run: data.Run) -> None:
 
 
 def test_dead_pixels_are_counted(tmp_path: Path) -> None:
-    assert "5 dead sensor pixels are excluded" in page(letter_run(tmp_path, dead=5), None, "0")
+    assert "Sensor pixels left out: 5 dead" in page(letter_run(tmp_path, dead=5), None, "0")
 
 
 def test_without_the_truth_a_page_has_no_comparison(tmp_path: Path) -> None:

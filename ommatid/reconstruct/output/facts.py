@@ -28,7 +28,7 @@ METHODS = {
     "total_variation": "total variation",
 }  # of `--baselines`
 
-Topic = Literal["verdict", "error", "quality", "limit", "time", "stage", "region"]
+Topic = Literal["verdict", "error", "quality", "limit", "time", "stage", "caution", "region"]
 LINES: tuple[Topic, ...] = "error", "quality", "limit", "time"  # of a summary, below the verdict
 
 
@@ -288,9 +288,10 @@ def _solver(solver: SolverReport) -> list[Fact]:
 def _diagnostics(diagnostics: DiagnosticsReport) -> list[Fact]:
     found: list[Fact] = []
     if diagnostics.pixels_dead:
-        found.append(Fact("sensor pixels left out", f"{diagnostics.pixels_dead} dead"))
+        found.append(Fact("sensor pixels left out", f"{diagnostics.pixels_dead} dead", topic="caution"))
     if diagnostics.pixels_saturated:
-        found.append(Fact("saturated sensor pixels", f"{diagnostics.pixels_saturated}, known to reach the limit"))
+        reach = f"{diagnostics.pixels_saturated}, known to reach the limit"
+        found.append(Fact("saturated sensor pixels", reach, topic="caution"))
     residual = diagnostics.chi_squared
     if residual is not None:
         expected = f"expected {residual.expected:.4g} +/- {residual.deviation:.2g}"

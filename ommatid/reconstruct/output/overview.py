@@ -14,8 +14,9 @@ import numpy as np
 
 from ommatid.figures.panels import FigurePanel, FigureScale, draw_panel
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
-from ommatid.runtime.arrays import Float32Array
+from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.printable import printable_label
+from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.stack import Stack
 
 from . import verdict_words
@@ -114,13 +115,19 @@ def _sub_images(stack: Stack, grey: FigureScale) -> list[FigurePanel]:
     return panels
 
 
-def placed_sub_image(stack: Stack, name: str | None, grey: FigureScale) -> FigurePanel:
-    """Return a sub-image, as bright as f, where it looks at; name : None for the middle one of the finest type."""
+def sub_image_of(stack: Stack, name: str | None = None) -> tuple[SubImager, FloatArray]:
+    """Return a sub-imager with its image, (rows, columns); name : None for the middle one of the finest type."""
     camera = stack.camera
     if name is None:
         finest = min(camera.types, key=lambda lens_type: lens_type.ratio)
         name = camera.sub_imager(camera.types.index(finest), finest.array[0] // 2, finest.array[1] // 2).name
-    [(sub, image)] = [pair for pair in zip(camera.sub_imagers, stack.images(), strict=True) if pair[0].name == name]
+    return next(pair for pair in zip(camera.sub_imagers, stack.images(), strict=True) if pair[0].name == name)
+
+
+def placed_sub_image(stack: Stack, name: str | None, grey: FigureScale) -> FigurePanel:
+    """Return a sub-image, as bright as f, where it looks at; name : None for the middle one of the finest type."""
+    sub, image = sub_image_of(stack, name)
+    name = sub.name
     place = float(sub.window[0]), float(sub.window[1]), float(sub.type.ratio)
     title = f"Sub-image {name}\nmagnification {1 / sub.type.ratio}"
     return FigurePanel(title, image / float(sub.type.light), grey, place=place)

@@ -32,8 +32,9 @@ from .run_json import (
 def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunReport:
     """Return the content of run.json, without a fingerprint."""
     start = perf_counter()
-    held_out, single = _held_out(restoration, stack), _single(restoration, stack)
-    error = _error(restoration, single)
+    held_out, best = _held_out(restoration, stack), _single(restoration, stack)
+    single: dict[str, Any] = {} if best is None else {"baselines": (best,)}
+    error = _error(restoration, best)
     stages = {
         "render": _stage(stack.record),
         "calibrate": _stage(model.record),
@@ -71,7 +72,7 @@ def report_of(stack: Stack, model: Model, restoration: Reconstruction) -> RunRep
             calibration=model.record.get("first_seed"),
         ),
         **held_out,
-        **({} if single is None else {"baselines": (single,)}),
+        **single,
     )
 
 
@@ -92,8 +93,7 @@ def _single(restoration: Reconstruction, stack: Stack) -> MethodReport | None:
     single = best_single_sub_image(stack, restoration.truth)
     if single is None or restoration.error is None:
         return None
-    errors = {"mse": single.mse, "psnr": single.psnr, "ssim": single.ssim}
-    return MethodReport(method="single", sub_imager=single.name, **errors)
+    return MethodReport(method="single", sub_imager=single.name, mse=single.mse, psnr=single.psnr, ssim=single.ssim)
 
 
 def _error(restoration: Reconstruction, single: MethodReport | None) -> ErrorReport:

@@ -35,7 +35,7 @@ from .run_json import RUN, RegionReport, RunReport
 
 Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the corner, rows and columns
 
-ESTIMATE, PICTURE, STACK = "estimate.exr", "estimate.png", "stack.exr"
+ESTIMATE, PICTURE, STACK, BASELINES = "estimate.exr", "estimate.png", "stack.exr", "baselines.exr"
 PNG_END = b"IEND\xaeB`\x82"
 ESTIMATOR_TABLES = ("prior", "estimator", "tiles")
 
@@ -146,9 +146,9 @@ def write_results(folder: Path, stack: Stack, restoration: Reconstruction, repor
     Those of an earlier result are removed first, so that nothing of two results is ever in a folder.
     """
     if any((folder / name).exists() for name in (ESTIMATE, RUN)):
-        formats = (format_file(folder / ESTIMATE, name) for name in ("npy", "tiff16"))
-        for path in (*formats, folder / RUN, folder / ESTIMATE):  # the estimate last: it tells that there was one
-            path.unlink(missing_ok=True)
+        formats = [format_file(folder / ESTIMATE, name).name for name in ("npy", "tiff16")]
+        for name in (*formats, BASELINES, RUN, ESTIMATE):  # the estimate last: it tells that there was one
+            (folder / name).unlink(missing_ok=True)
     write_picture(folder / PICTURE, restoration.estimate.reshape(restoration.shape))
     write_overview(folder, stack, maps_of(restoration), report)
     write_estimate(folder / ESTIMATE, restoration, record_of(report))

@@ -64,16 +64,53 @@ def grounds(report: RunReport) -> str:
     )
 
 
+class NextStep(NamedTuple):
+    """A change, how to make it, and the mean squared error with it.
+
+    causes : of the parts of the error that it reduces;  is_bound : True if the error is at most `mse`
+    seconds : of the run with the change, None if not known
+    """
+
+    change: str
+    how: str
+    mse: float
+    causes: tuple[str, ...] = ()
+    is_bound: bool = False
+    seconds: float | None = None
+
+
+def steps_of(report: RunReport) -> list[NextStep]:
+    """Return the changes that reduce parts of the error of a run, as far as its own numbers tell."""
+    now, budget = report.error.predicted_mse, report.error.budget
+    steps = [
+        NextStep(words, how, now - (1 - factor) * budget.get(name, 0.0), (name,), is_bound=True)
+        for name, (words, how, factor) in CHANGES.items()
+    ]
+    sampled = {name: key for name, key in SAMPLES.items() if budget.get(name)}
+    for more in report.more_samples:
+        if more.times == TIMES and sampled and follows_samples(report):
+            words, how = "four times the samples", " and ".join(sampled.values())
+            steps.append(NextStep(words, how, more.predicted_mse, tuple(sampled), seconds=more.seconds))
+    return steps
+
+
 def limit(report: RunReport) -> str:
     """Return what limits the error in half a sentence: the cause, its share, and a change that would reduce it."""
     if not is_trusted(report):
         return "unknown as long as the result is not to be trusted"
-    if report.error.predicted_mse <= 0:
+    now = report.error.predicted_mse
+    if now <= 0:
         return "nothing: the predicted error is zero"
-    error = report.error
-    name, part = max(error.budget.items(), key=lambda item: item[1])
-    change = _change(name, part, report)
-    return f"{cause(name)}, {100 * part / error.predicted_mse:.0f} % of the predicted MSE{change}"
+    name, part = max(report.error.budget.items(), key=lambda item: item[1])
+    words = f"{cause(name)}, {100 * part / now:.0f} % of the predicted MSE"
+    if name == "null_space":
+        cure = "`ommatid design` chooses lens types that leave none"
+        return f"{words}; neither samples nor less noise reduce it ({cure})"
+    step = next((step for step in steps_of(report) if name in step.causes), None)
+    if step is None or (not step.is_bound and step.mse >= (1 - LEAST_GAIN) * now):
+        return words
+    how = "" if name in ("noise", "frames", "misalignment") else f" ({step.how})"
+    return f"{words}; {step.change}{how}: RMS {sqrt(now):.3g} to {sqrt(step.mse):.3g} grey levels"
 
 
 def error_words(mse: float, digits: int = 4) -> str:
@@ -93,24 +130,3 @@ def cause(name: str) -> str:
         "misalignment": "misalignment of the lenses",
     }
     return words.get(name, name.replace("_", " "))
-
-
-def _change(name: str, part: float, report: RunReport) -> str:
-    error, now = report.error, report.error.predicted_mse
-    if name == "null_space":
-        return "; neither samples nor less noise reduce it (`ommatid design` weighs it against noise)"
-    if name in CHANGES:
-        change = CHANGES[name]
-        words = f"{change.words} ({change.how})" if name == "quantisation" else change.words
-        return f"; {words}: {_fall(now, now - (1 - change.factor) * part)}"
-    if name not in SAMPLES or not follows_samples(report):
-        return ""
-    more = next((more for more in report.more_samples if more.times == TIMES), None)
-    if more is not None and more.predicted_mse < (1 - LEAST_GAIN) * now:
-        keys = " and ".join(key for part_name, key in SAMPLES.items() if error.budget.get(part_name))
-        return f"; four times the samples ({keys}): {_fall(now, more.predicted_mse)}"
-    return ""
-
-
-def _fall(now: float, then: float) -> str:
-    return f"RMS {sqrt(now):.3g} to {sqrt(then):.3g} grey levels"

@@ -16,24 +16,8 @@ from ..input_files import kind, real_path
 from ..printable import printable
 
 # Suffixes of all files that are written; a folder may hold anything else.
-SUFFIXES = frozenset(
-    (
-        ".exr",
-        ".npz",
-        ".npy",
-        ".png",
-        ".gif",
-        ".svg",
-        ".pdf",
-        ".tiff",
-        ".json",
-        ".jsonl",
-        ".csv",
-        ".md",
-        ".html",
-        ".toml",
-    )
-)
+_SUFFIXES = ".exr .npz .npy .png .gif .svg .pdf .tiff .json .csv .html .toml"
+SUFFIXES = frozenset(_SUFFIXES.split())
 LONGEST = 200  # bytes of a name: 255, less what is added to the names of temporary files
 SHORT = 110  # characters of each of two paths in one sentence
 _SYSTEM = Path("/dev"), Path("/proc"), Path("/sys")

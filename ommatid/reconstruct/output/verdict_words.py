@@ -104,7 +104,7 @@ def limit(report: RunReport) -> str:
     name, part = max(report.error.budget.items(), key=lambda item: item[1])
     words = f"{cause(name)}, {100 * part / now:.0f} % of the predicted MSE"
     if name == "null_space":
-        cure = "`ommatid design` chooses lens types that leave none"
+        cure = "`ommatid design` weighs it against noise"
         return f"{words}; neither samples nor less noise reduce it ({cure})"
     step = next((step for step in steps_of(report) if name in step.causes), None)
     if step is None or (not step.is_bound and step.mse >= (1 - LEAST_GAIN) * now):

@@ -17,6 +17,7 @@ from math import ceil, pi
 from typing import ClassVar
 
 import numpy as np
+from scipy import ndimage
 from scipy.interpolate import CubicSpline
 
 from ommatid.runtime.arrays import FloatArray
@@ -70,6 +71,15 @@ class LensField(ABC):
 
         half : of the width of the grid that the wave's nodes serve, where it is wider than that of its own
         """
+
+    @property
+    @abstractmethod
+    def cone(self) -> float:
+        """Projected solid angle, sr, on the axis, of what evenly spread rays go through."""
+
+    def lit_share(self, height: FloatArray) -> FloatArray:
+        """Return the mean weight, cos^4 or 0 where they are blocked, of rays that go evenly spread through the lens."""
+        return self.brightness(height) / self.cone
 
     def rays(self, height: float, finest: float) -> Wavefront:
         """Return the rays of a sensor point that gets light, as many as resolve a period on the target."""
@@ -229,9 +239,10 @@ class SurfaceField(LensField):
         """Trace the wave through the surfaces; see `LensField.wave`."""
         return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, half)
 
-    def lit_share(self, height: FloatArray) -> FloatArray:
-        """Return the mean weight of rays that leave evenly spread over the exit disk, as `trace` gives it."""
-        return self.brightness(height) / (pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2)
+    @property
+    def cone(self) -> float:
+        """Of the exit disk; see `LensField.cone`."""
+        return pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,6 +256,11 @@ class ThinField(LensField):
     def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
         """Compute the wave, whose phase is quadratic; see `LensField.wave`."""
         return thin_wavefront(self.aperture, self.depth, height, self.distance, self.focus, wavelength, half)
+
+    @property
+    def cone(self) -> float:
+        """Of the aperture; see `LensField.cone`."""
+        return pi * (self.aperture / 2 / self.depth) ** 2
 
     def rays(self, height: float, finest: float) -> Wavefront:
         """Return the rays of a sensor point; see `LensField.rays`."""
@@ -263,7 +279,7 @@ class SamplingTables:
 
     heights : of the sensor point, (h,);  vergences : 1 / distance of the target, rising, (v,)
     densities : (h, v, n, n), rows along the direction of the sensor point;  width : of the slopes of all n points
-    captured : share of the light within that width
+    captured : share of the light within that width;  spot : radius of the light's bright part, as a slope
     """
 
     heights: FloatArray
@@ -271,6 +287,13 @@ class SamplingTables:
     densities: FloatArray
     width: float
     captured: float
+    spot: float
+
+    @property
+    def spread(self) -> FloatArray:
+        """The densities times (1 + (r / spot)^2)^1/2, so that faint light far away gets more of the rays."""
+        place = self.width * np.linspace(-0.5, 0.5, self.densities.shape[-1])
+        return self.densities * np.sqrt(1 + (place[:, None] ** 2 + place**2) / self.spot**2)
 
 
 def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: float) -> SamplingTables:
@@ -283,7 +306,7 @@ def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: 
     heights, vergences = field.nodes[0], np.where(np.abs(vergences) < LEAST_VERGENCE, LEAST_VERGENCE, vergences)
     cases = [(replace(field, distance=1 / v), float(height), abs(v)) for height in heights for v in vergences]
     slopes = [(each.resolution * v, each.spot_radius * v) for each, v in ((at.outline(h), v) for at, h, v in cases)]
-    cell = min(fine for fine, _ in slopes) / cells
+    cell, bright = min(fine for fine, _ in slopes) / cells, max(spot + fine for fine, spot in slopes)
     half = max(spot + reach * fine for fine, spot in slopes)
     tables: list[FloatArray] = []
     captured: list[float] = []
@@ -292,11 +315,13 @@ def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: 
         values = spread.values if at.distance > 0 else spread.values[::-1, ::-1]
         damping = np.maximum(np.sinc(np.fft.fftfreq(len(values))) ** 2, np.sinc(1 / cells) ** 2)
         sharpened = np.fft.ifft2(np.fft.fft2(values) / np.outer(damping, damping)).real
-        tables.append(np.maximum(sharpened, 0.0) / spread.inside)
+        kept = np.maximum(sharpened, 0.0)  # sharpened rings are negative where they are dark
+        mean, excess = (ndimage.uniform_filter(each, 2 * cells) for each in (sharpened, kept))
+        tables.append(kept * mean / excess / spread.inside)
         captured.append(spread.inside)
     shape = (heights.size, vergences.size, *tables[0].shape)
     densities = np.stack(tables).reshape(shape).astype(np.float64)
-    return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)))
+    return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)), bright)
 
 
 def check_waves(lens_type: LensType, field: LensField) -> None:

@@ -19,8 +19,7 @@ import ommatid
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.geometry.optical_terms import optical_terms
-from ommatid.scenes.optics.etendue import transmissions
-from ommatid.scenes.optics.radiometry import electrons
+from ommatid.scenes.optics.radiometry import electrons, transmissions
 from ommatid.scenes.scene import read
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.variant import unusable_reason

@@ -21,13 +21,12 @@ from ommatid.runtime.files import digest, fingerprint
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.model import Model
-from ommatid.scenes.optics.radiometry import predicted_noise
+from ommatid.scenes.optics.radiometry import electrons, predicted_noise
 from ommatid.scenes.scene import Scene, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
 from ommatid.simulate.render import exposed
-from ommatid.simulate.sensors import response
 
 NEGLIGIBLE = 0.03  # variance relative to the other noise of a measurement
 TINY = float(np.finfo(np.float64).tiny)
@@ -59,7 +58,7 @@ def for_prior(setup: Setup) -> StoppingRule:
             " there is none; set noise.variance above 0, or give calibration.samples a number"
         )
     if scene.sensor is not None:
-        predicted_noise(scene, camera, response(setup))
+        predicted_noise(scene, camera, electrons(scene, camera))
 
     def added(model: Model) -> float:
         mean, deviation = scene.prior.mean, scene.prior.variance**0.5

@@ -78,12 +78,8 @@ def electrons(setup: Setup) -> dict[str, Any] | None:
     """Return the electrons that the pixels of each lens type collect; None without a [sensor]."""
     if setup.scene.sensor is None:
         return None
-    from ommatid.scenes.optics.radiometry import summary
-    from ommatid.simulate.sensors import response
+    from ommatid.scenes.optics import radiometry
 
-    light = summary(setup.scene, setup.camera, response(setup))
-    if all(lens_type.optics.surfaces is None for lens_type in setup.camera.types):
-        return light
-    from ommatid.scenes.optics.etendue import transmissions
-
-    return {**light, "transmitted": transmissions(setup.camera)}
+    light = radiometry.summary(setup.scene, setup.camera, radiometry.electrons(setup.scene, setup.camera))
+    passed = radiometry.transmissions(setup.camera)
+    return {**light, "transmitted": passed} if passed else light

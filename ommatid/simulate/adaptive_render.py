@@ -434,14 +434,14 @@ def allowed_variance(setup: Setup) -> AllowedVariance:
     if sensor is None:
         known = 0.0 if noise is None else noise.variance + noise.quantisation_variance
         return lambda _, rows: SHARE * known / np.square(received[rows])
-    from .sensors import response
+    from ommatid.scenes.optics.radiometry import electrons
 
-    electrons = response(setup)
-    level = flat_values(sensor, setup.camera, electrons)
+    response = electrons(setup.scene, setup.camera)
+    level = flat_values(sensor, setup.camera, response)
 
     def of_sensor(light: FloatArray, rows: slice) -> FloatArray:
         values = received[rows] * np.maximum(np.nan_to_num(light), 0.0)
-        expected = expected_recording_of(sensor, level[rows], electrons[rows], values)
+        expected = expected_recording_of(sensor, level[rows], response[rows], values)
         return SHARE * expected.noise_variance(values) / np.square(received[rows])
 
     return of_sensor

@@ -162,12 +162,14 @@ def exposed(setup: Setup, light: FloatArray, variance: FloatArray, record: dict[
 
 
 def _recording(setup: Setup, sensor: SensorTable, light: FloatArray) -> Recording:
-    from .sensors import record, response
+    from ommatid.scenes.optics.radiometry import electrons
+
+    from .sensors import record
 
     dark = np.isnan(light)  # no light can reach these pixels, so their flat frame marks them as dead
-    electrons = np.where(dark, 0.0, response(setup))
+    response = np.where(dark, 0.0, electrons(setup.scene, setup.camera))
     shot = negligible_shot_noise(setup.scene, setup.camera) is None
-    return record(np.where(dark, 0.0, light), electrons, sensor, setup.camera, setup.scene.render.seed, shot)
+    return record(np.where(dark, 0.0, light), response, sensor, setup.camera, setup.scene.render.seed, shot)
 
 
 def render_bands(

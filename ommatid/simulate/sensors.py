@@ -18,9 +18,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, stream
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import SubImager
-from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.recording import ROUNDING, Recording, dark_electrons, flat_values
-from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.sensor import NoiseTable, SensorTable
 
 MOST_READINGS = 400_000  # of the frames of a sub-imager that are drawn one by one
@@ -142,18 +140,3 @@ def expose(light: FloatArray, noise: NoiseTable, rngs: list[np.random.Generator]
 def generators(camera: Camera, seed: int) -> list[np.random.Generator]:
     """Return one generator per sub-imager, independent of the other lens types of the camera."""
     return [generator(seed, Purpose.NOISE, sub) for sub in camera.sub_imagers]
-
-
-def response(setup: Setup) -> FloatArray:
-    """Return the electrons per unit of f, (M,).
-
-    Raises ValueError without a [sensor], InputError for a lens whose surfaces form no image.
-    """
-    scene, camera = setup.scene, setup.camera
-    if all(lens_type.optics.surfaces is None for lens_type in camera.types):
-        return electrons(scene, camera)
-    from ommatid.scenes.optics.etendue import relative_illumination, solid_angles, transmissions
-
-    passed = transmissions(camera)
-    transmitted = {name: angle * passed[name] for name, angle in solid_angles(camera).items()}
-    return electrons(scene, camera, transmitted, relative_illumination(camera))

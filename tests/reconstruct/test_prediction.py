@@ -10,12 +10,12 @@ from ommatid.reconstruct.measured_error import measure_error, trimmed_mean
 from ommatid.reconstruct.prediction import Prediction
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
+from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.recording import expected_recording
 from ommatid.scenes.scene import read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import PriorTable
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.sensors import response
 
 from ..examples import GALLERY
 
@@ -90,10 +90,10 @@ def test_the_noise_of_a_sensor_is_that_of_its_picture() -> None:
     apertures = tuple(f'camera.lens.{name}.aperture="0.1 mm"' for name in ("I", "II", "III"))
     scene = read(GALLERY / "tile19.toml", (*apertures, *sensor))
     setup = Setup.from_scene(scene)
-    dense, electrons = ideal_matrix(setup.camera).toarray(), response(setup)
+    dense, response = ideal_matrix(setup.camera).toarray(), electrons(scene, setup.camera)
     assert scene.sensor is not None
     light = dense @ setup.image.ravel()
-    noise = expected_recording(scene.sensor, setup.camera, electrons, light).noise_variance(light)
+    noise = expected_recording(scene.sensor, setup.camera, response, light).noise_variance(light)
     exact = np.linalg.inv(dense.T @ (dense / noise[:, None]) + np.eye(361) / PRIOR.variance)
     prediction = predict_scene(scene, rays=False)
     assert prediction.mse == pytest.approx(float(np.trace(exact)) / 361, rel=0.02)

@@ -16,12 +16,12 @@ from ommatid.scenes import stack as stacks
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.optics import sharpness
+from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.render import render
 from ommatid.simulate.renderer.plugins import export
-from ommatid.simulate.sensors import response
 
 from ..examples import THREE, Lenses, mean_weights, needs, scene
 
@@ -91,7 +91,8 @@ def test_pixels_that_no_light_can_reach_are_dead(tmp_path: Path) -> None:
     assert usable_pixels(stack, model).dead >= dark.sum()
     with_sensor = built({"surfaces": BIPLANE}, (("1/3", [1, 1], [25, 25]),), (75, 75), "none", sensor=SENSOR)
     # Dark is where one of 16 passes of 64 rays brought nothing: a fifth of the light makes that a chance of 1e-5.
-    assert (response(Setup(with_sensor, camera))[dark] < 0.2 * response(Setup(with_sensor, camera)).max()).all()
+    freed = electrons(with_sensor, camera)
+    assert (freed[dark] < 0.2 * freed.max()).all()
     counted = render(Setup(with_sensor, camera, truth))
     assert np.isnan(counted.values[dark]).all()
 
@@ -104,7 +105,7 @@ def test_electrons_follow_the_rendered_light() -> None:
 
     described = built({"surfaces": BIPLANE[1:]}, sensor=SENSOR)
     camera = derive(described)
-    freed = response(Setup(described, camera))
+    freed = electrons(described, camera)
     renderer = Renderer(camera, "llvm_ad_mono", together=False)
     for group in renderer.groups:
         light, rows = mean_weights(renderer, group, 2**14), renderer.rows(group)

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
-from ommatid.scenes.optics.etendue import transmission, transmissions
 from ommatid.scenes.optics.field import prescription_of
 from ommatid.scenes.optics.prescription import Prescription
-from ommatid.scenes.scene import read
-from ommatid.scenes.setup import Setup
-from ommatid.simulate.sensors import response
+from ommatid.scenes.optics.radiometry import electrons, transmission, transmissions
+from ommatid.scenes.scene import Scene, read
 
 from ..conftest import Command
 from ..examples import GALLERY
@@ -53,10 +52,14 @@ def test_a_coating_takes_the_place_of_surfaces_to_air() -> None:
     assert transmission(in_air, 0.5) == 1, "a stop in air reflects nothing"
 
 
+def collected(scene: Scene) -> FloatArray:
+    return electrons(scene, derive(scene))
+
+
 def test_electrons_are_those_that_pass() -> None:
     changes = [SENSOR, "noise="]
     bare, coated = (
-        response(Setup.from_scene(read(GALLERY / "doublet.toml", [*changes, *more])))
+        collected(read(GALLERY / "doublet.toml", [*changes, *more]))
         for more in ([], [f"camera.lens.{name}.coating=0.0" for name in ("I", "II", "III")])
     )
     np.testing.assert_allclose(bare / coated, 0.8747 / (1 - CEMENT), rtol=1e-3)

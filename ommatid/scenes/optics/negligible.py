@@ -81,9 +81,7 @@ def noise_variance(scene: Scene, camera: Camera) -> float:
         return 0.0
     from . import radiometry
 
-    # Lenses with surfaces are always simulated in full; a solid angle of 0 takes their pixels out of the minimum.
-    without = {lens_type.name: 0.0 for lens_type in camera.types if lens_type.optics.surfaces is not None}
-    variances = radiometry.expected_noise(scene, camera, radiometry.electrons(scene, camera, without))
+    variances = radiometry.expected_noise(scene, camera, radiometry.electrons(scene, camera))
     return float(np.nanmin(variances, initial=np.inf))
 
 

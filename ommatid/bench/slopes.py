@@ -17,8 +17,8 @@ from ommatid.scenes.constants import WHITE
 from ommatid.scenes.shrinkage import shrink_variances
 from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
-from ommatid.simulate.sampling.samplers import corners, law
 
+from .convergence import corners, law
 from .table import AUTO, DENSE, STAGES, Cell, ConvergenceCurve, Recommendation, RecommendedSetting, Stage
 
 Item = TypeVar("Item")

@@ -21,18 +21,9 @@ from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import Model, designed_observation, fitted_model, is_stored
-from ommatid.scenes.optics.boxes import overlap
+from ommatid.scenes.optics.boxes import designed_box, designed_matrix
 from ommatid.scenes.pose import pose_of, poses
 from ommatid.scenes.scene import Scene
-
-
-def sub_matrix(camera: Camera, sub: SubImager) -> sparse.csr_array:
-    """Return H of one sub-imager behind a pinhole: (its pixels, N)."""
-    down, across = (
-        overlap(sub.type.ratio, pixels, start, size, part)
-        for pixels, start, size, part in zip(sub.type.pixels, sub.window, camera.shape, sub.type.open, strict=True)
-    )
-    return float(sub.type.light) * sparse.csr_array(sparse.kron(down, across, format="csr"))
 
 
 def ideal_matrix(camera: Camera) -> sparse.csr_array:
@@ -51,24 +42,18 @@ def ideal_matrix(camera: Camera) -> sparse.csr_array:
 
 
 def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
-    subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
-    blurred = camera.is_blurred(lens_type)
     if lens_type.optics.distortion is not None or lens_type.is_rotated:
         from ommatid.scenes.optics import footprints
 
-        if blurred:
+        if camera.is_blurred(lens_type):
             raise InputError(
                 f"camera.lens.{lens_type.name}: distortion or a rotated sub-imager with defocus, diffraction or"
                 " pixel_blur has no closed form; run with calibration.method 'transport', or remove one of them"
             )
+        subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
         parts = [footprints.sub_matrix(camera, sub, pose_of(sub)) for sub in subs]
-    elif blurred:
-        from ommatid.scenes.optics.lens_kernels import blurred_matrix
-
-        return blurred_matrix(camera, lens_type)
-    else:
-        parts = [sub_matrix(camera, sub) for sub in subs]
-    return sparse.csr_array(sparse.vstack(parts, format="csr"))
+        return sparse.csr_array(sparse.vstack(parts, format="csr"))
+    return designed_matrix(camera, lens_type)
 
 
 def true_matrix(camera: Camera) -> sparse.csr_array:

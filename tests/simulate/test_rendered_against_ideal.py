@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from ommatid.bench.convergence import corners
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
@@ -23,7 +24,7 @@ from ommatid.simulate.calibration.responses import measured
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import light
 from ommatid.simulate.sampling.passes import Rendering, rounding_variance
-from ommatid.simulate.sampling.samplers import corners, fitting
+from ommatid.simulate.sampling.samplers import fitting
 
 from ..examples import SLOW_SCALAR, THREE, VARIANTS, assert_student, familywise, needs, scene
 

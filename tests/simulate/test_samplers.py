@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
+from ommatid.bench.convergence import corners, law
 from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.picture import load
@@ -21,7 +22,7 @@ from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate
 from ommatid.simulate.sampling.passes import plan
-from ommatid.simulate.sampling.samplers import corners, filling, fitting, law
+from ommatid.simulate.sampling.samplers import filling, fitting
 
 from ..examples import SLOW_SCALAR, THREE, VARIANTS, camera, familywise, needs, scene
 

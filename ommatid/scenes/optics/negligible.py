@@ -161,6 +161,7 @@ def _change(
     Returns the largest change for values from 0 to 255, and the larger mean square for images of the prior. At the
     corner rays miss the target, so that a row of H changes its sum, and sees less of the prior's mean.
     """
+    from .boxes import designed_matrix
     from .field import light_reach
 
     margin = ceil(light_reach(camera, lens_type)) + 1
@@ -172,7 +173,7 @@ def _change(
         for each, its_type in ((camera, lens_type), (other_camera, other_type)):
             single = replace(its_type, array=(1, 1), pixels=(1, 1), origin=origin, left=None)
             small = replace(each, rows=rows, columns=columns, types=(single,), lens_columns=None)
-            matrices.append(_designed(small, single))
+            matrices.append(designed_matrix(small, single))
         row = sparse.csr_array(matrices[0] - matrices[1]).data
         lost, squares = float(row.sum()) ** 2, float(np.square(row).sum())
         if prior.kind != "independent":
@@ -180,16 +181,6 @@ def _change(
         largest = max(largest, WHITE * float(row[row > 0].sum()), -WHITE * float(row[row < 0].sum()))
         mean_square = max(mean_square, prior.mean**2 * lost + prior.variance * squares)
     return largest, mean_square
-
-
-def _designed(camera: Camera, lens_type: LensType) -> sparse.csr_array:
-    if not camera.is_blurred(lens_type):
-        from .boxes import designed_box
-
-        return designed_box(camera.shape, lens_type).to_sparse()
-    from .lens_kernels import blurred_matrix
-
-    return blurred_matrix(camera, lens_type)
 
 
 @cache

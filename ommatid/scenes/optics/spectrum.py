@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
-from math import inf
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,8 +22,7 @@ from ommatid.runtime.errors import InputError
 from ..constants import GREEN
 from ..formats.curve import Curve, read_curve
 from ..scene import Scene
-from ..tables.camera import RAYS, LensTable, Surface
-from ..tables.glass import index_behind
+from ..tables.camera import RAYS, LensTable
 from ..tables.sensor import MILLIMETRE
 
 PLANCK, LIGHT_SPEED = 6.62607015e-34, 299792458.0  # J s, m/s: exact in the SI
@@ -162,10 +160,13 @@ def _defocus(scene: Scene, lens: LensTable, wavelength: FloatArray, middle: floa
     """
     if lens.surfaces is None or isinstance(lens.surfaces, str):
         return np.zeros(wavelength.size)
+    from .prescription import prescribe
+
     found = list[tuple[float, float, float]]()
     for place in map(float, np.linspace(float(wavelength[0]), float(wavelength[-1]), FEWEST)):
-        with suppress(InputError):  # a range of measured indices that ends, or an unknown glass, refused elsewhere
-            found.append((place, *_power(lens.surfaces, place / MILLIMETRE)))
+        with suppress(InputError):  # a range of measured indices that ends, or what is refused elsewhere
+            surfaces = prescribe(lens.surfaces, place / MILLIMETRE)
+            found.append((place, 1 / surfaces.focal_length, surfaces.entrance_pupil.radius))
     at, powers, radii = np.array(found).reshape(-1, 3).T
     power = np.interp(middle, at, powers) if at.size else 0.0
     if power <= 0:
@@ -175,22 +176,6 @@ def _defocus(scene: Scene, lens: LensTable, wavelength: FloatArray, middle: floa
     distance = distance if whole is None else whole * pitches / (1 + pitches)
     scale = lens.scale if isinstance(lens.scale, float) else power * distance / (1 + pitches)
     return radii[0] ** 2 * scale * (np.interp(wavelength, at, powers) - power) / (2 * wavelength / MILLIMETRE)
-
-
-def _power(surfaces: Sequence[Surface], wavelength: float) -> tuple[float, float]:
-    """Return 1 / focal length of surfaces, and the radius of the entrance pupil, by a ray that enters at height 1.
-
-    Raises InputError for an index that is unknown at the wavelength, in mm.
-    """
-    height, slope, before, radii = 1.0, 0.0, 1.0, list[float]()
-    for surface in surfaces:
-        radii.append(surface.semi_diameter / max(abs(height), 1e-30))
-        index = index_behind(surface, wavelength)
-        slope -= height * (index - before) / (surface.radius or inf)
-        height += (surface.thickness or 0.0) / index * slope
-        before = index
-    marked = [radius for radius, surface in zip(radii, surfaces, strict=True) if surface.stop]
-    return -slope, min(marked or radii)
 
 
 def nodes(

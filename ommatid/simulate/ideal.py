@@ -21,7 +21,7 @@ from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import Model, designed_observation, fitted_model, is_stored
-from ommatid.scenes.optics.boxes import designed_box, designed_matrix
+from ommatid.scenes.optics.boxes import designed_box
 from ommatid.scenes.pose import pose_of, poses
 from ommatid.scenes.scene import Scene
 
@@ -53,7 +53,11 @@ def _type_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
         subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
         parts = [footprints.sub_matrix(camera, sub, pose_of(sub)) for sub in subs]
         return sparse.csr_array(sparse.vstack(parts, format="csr"))
-    return designed_matrix(camera, lens_type)
+    if not camera.is_blurred(lens_type):
+        return designed_box(camera.shape, lens_type).to_sparse()
+    from ommatid.scenes.optics.lens_kernels import blurred_matrix
+
+    return blurred_matrix(camera, lens_type)
 
 
 def true_matrix(camera: Camera) -> sparse.csr_array:

@@ -98,7 +98,7 @@ def test_errors_of_h_f_are_as_large_as_expected() -> None:
 
 
 def diffracting(shape: tuple[int, int]) -> Camera:
-    """A camera of lenses whose light reaches 115 pixels of f."""
+    """A camera of lenses whose light reaches 117 pixels of f."""
     optics = {"aperture": "0.4 mm"}, {"wavelength": "550 nm", "lens_pitch": "1 mm"}
     return with_optics(*optics, (("1/3", [3, 3], [6, 6]),), shape)[1]
 
@@ -132,19 +132,12 @@ def test_wide_kernels_are_learnt_where_they_deviate() -> None:
     assert np.abs((learnt - truth) @ image).max() < 0.1 * np.abs((designed - truth) @ image).max()
 
 
-def test_components_of_a_varying_blur_are_learnt() -> None:
-    camera = defocused()
-    truth = varying(camera).to_sparse()
-    responses = drawn(truth, np.random.default_rng(3), 4096)
-    fit = fit_kernels(responses, camera, camera.types[0])
-    record = json.loads(json.dumps(fit.record()))
-    assert record["degree"] == 2
-    assert record["components"]["count"] >= 3
-    learnt = accepted(fit).to_sparse()
-    first = KernelShapes.dense(varying(camera).shapes.kernels[:1])
-    mean = replace(varying(camera), shapes=first, coefficients=np.eye(1, 6)).to_sparse()
-    assert rms(learnt - truth, truth.nnz) < 0.1 * rms(mean - truth, truth.nnz)
-    assert rms(learnt - truth, truth.nnz) < 0.4 * rms(responses.matrix - truth, truth.nnz)
+def test_a_deviation_that_varies_over_the_field_is_rejected() -> None:
+    camera = defocused((("1/3", [1, 1], [6, 6]),))
+    fit = fit_kernels(drawn(varying(camera).to_sparse(), np.random.default_rng(3), 4096), camera, camera.types[0])
+    assert not fit.accepted
+    assert "field" in fit.reason
+    assert json.loads(json.dumps(fit.record()))["unexplained"] > 0
 
 
 def test_some_pixels_are_enough() -> None:

@@ -145,15 +145,6 @@ def designed_box(shape: tuple[int, int], lens_type: LensType) -> Box:
     return Box(lens_type, down, across)
 
 
-def designed_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
-    """H of a lens type as designed, without distortion and rotation: (measurements, N). Raises as `matrix` does."""
-    if not camera.is_blurred(lens_type):
-        return designed_box(camera.shape, lens_type).to_sparse()
-    from .lens_kernels import blurred_matrix
-
-    return blurred_matrix(camera, lens_type)
-
-
 def _axis(size: int, lens_type: LensType, axis: int) -> BoxAxis:
     ratio, pixels, starts = lens_type.ratio, lens_type.pixels[axis], lens_type.starts(axis)
     parts = [overlap(ratio, pixels, start, size, lens_type.open[axis]) for start in starts]

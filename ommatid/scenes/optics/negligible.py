@@ -161,8 +161,9 @@ def _change(
     Returns the largest change for values from 0 to 255, and the larger mean square for images of the prior. At the
     corner rays miss the target, so that a row of H changes its sum, and sees less of the prior's mean.
     """
-    from .boxes import designed_matrix
+    from .boxes import designed_box
     from .field import light_reach
+    from .lens_kernels import blurred_matrix
 
     margin = ceil(light_reach(camera, lens_type)) + 1
     nearest = (floor(min(start, end)) for start, end in lens_type.gaps(camera.shape))
@@ -173,7 +174,8 @@ def _change(
         for each, its_type in ((camera, lens_type), (other_camera, other_type)):
             single = replace(its_type, array=(1, 1), pixels=(1, 1), origin=origin, left=None)
             small = replace(each, rows=rows, columns=columns, types=(single,), lens_columns=None)
-            matrices.append(designed_matrix(small, single))
+            blurred = small.is_blurred(single)
+            matrices.append(blurred_matrix(small, single) if blurred else designed_box(small.shape, single).to_sparse())
         row = sparse.csr_array(matrices[0] - matrices[1]).data
         lost, squares = float(row.sum()) ** 2, float(np.square(row).sum())
         if prior.kind != "independent":

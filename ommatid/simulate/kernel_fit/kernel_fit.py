@@ -1,11 +1,12 @@
-"""H of a blurred lens type from learnt kernels instead of noisy entries.
+"""H of a blurred lens type by its kernels as designed, and by the mean deviation from these that rays show.
 
-The entries of a chart of sensor pixels determine how the kernels of `ommatid.scenes.fitted.kernels` deviate from the
-design: each cell is fitted by a polynomial of the field, of the degree of the least expected error, and the variation
-over the field is reduced to its principal components. Where the rays show no deviation, H is that of the design, with
-the errors of the simplest deviation. The explanation is rejected if the residuals scatter more than the batches say: by
-more than three times the noise in a picture, or a tenth of the entries' own variance. What is less, and shows in a
-picture, is added to the errors.
+The entries of a chart of sensor pixels determine the deviation of each cell, the same over the field; that a lens shows
+the mirrored picture at mirrored places averages it over eight images of the cells, or four. It is taken where it lowers
+the expected error of H f, estimated without bias from the scatter of the batches (Mallows 1973, Technometrics 15, 661);
+otherwise H is that of the design, with the errors of the deviation. F tests at 0.1 % for all together compare what is
+left with that scatter: in all cells, and in the means over sub-imagers and over rings of the field. Kernels that leave
+more than three times the noise in a picture, or a tenth of the entries' own variance, are rejected. What is less, and
+shows in a picture, is added to the errors.
 
 The directions in which the kernels are uncertain follow from fits to errors drawn from the scatter of the batches. A
 draw gives every pixel of the chart a random combination of its batches' deviations, which has the covariance of the
@@ -19,75 +20,29 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.fitted.kernels import KernelFootprints, basis, terms
+from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType
 
+from ..calibration.fit.chart import freedom_of
 from ..calibration.responses import Responses
 from ..ideal import designed_kernels
 from .deviations import Chart, chart_of
-from .selection import Candidate, Components, choose, components
 
+SIGNIFICANCE = 0.001  # at which a correct model is rejected, by all tests together
+SUPPORT = 0.01  # share of the chart's pixels that see a cell, below which it has no deviation
+RINGS = 4  # of the field, with equally many pixels of the chart
+SHOWN_PIXELS = 200  # of the chart, at most, for which errors in a picture are computed
 DRAWS = 64
 SHARE = 0.99  # of the expected variance of H f that the directions describe; they are scaled to all of it
-KERNELS = 0.999  # of that variance that the common kernels of the directions describe
-MOST_DIRECTIONS, MOST_KERNELS = 16, 32
+MOST_DIRECTIONS = 16
 MOST_SHOWN = 3.0  # of the variance that noise has in a picture: less is added to the errors
 MOST_UNEXPLAINED = 0.1  # of the entries' variance, with which kernels are still far better than entries
-
-
-def error_directions(chart: Chart, candidate: Candidate, parts: Components) -> tuple[FloatArray, FloatArray]:
-    """Return the kernels, (E, C), and the coefficients, (q, E, P), of errors of variance 1 each."""
-    errors = _projected(chart, _draws(chart, candidate) @ parts.triangle, parts)
-    draws, cells, count = errors.shape
-    shown = chart.seen(errors.swapaxes(1, 2) * chart.share**0.5).reshape(draws, -1)
-    values, vectors = np.linalg.eigh(shown @ shown.T)
-    total = float(values.sum())
-    if total <= 0:
-        return np.zeros((0, cells)), np.zeros((0, 0, count))
-    kept = _needed(values, SHARE, MOST_DIRECTIONS)
-    scale = ((1 + candidate.shown) * total / values[-kept:].sum() / draws) ** 0.5
-    directions = np.asarray(np.tensordot(vectors[:, -kept:].T * scale, errors, axes=1), dtype=np.float64)
-    terms = directions.swapaxes(1, 2).reshape(-1, cells)
-    shown = chart.seen(terms * chart.share**0.5)
-    values, vectors = np.linalg.eigh(shown @ shown.T)
-    vectors = vectors[:, -_needed(values, KERNELS, MOST_KERNELS) :]
-    shares = vectors.reshape(kept, count, -1).swapaxes(1, 2)
-    kernels: FloatArray = np.asarray(vectors.T @ terms, dtype=np.float64)
-    return kernels, np.asarray(shares @ np.linalg.inv(parts.triangle), dtype=np.float64)
-
-
-def _draws(chart: Chart, candidate: Candidate) -> FloatArray:
-    """Return coefficients of the kernels' errors: (draws, C, P)."""
-    rng, count = probe(Purpose.KERNEL_ERRORS), len(chart.batches)
-    x = basis(chart.field, candidate.degree)
-    entries = np.zeros((DRAWS, chart.inside.shape[1], x.shape[1]))
-    for batch in chart.batches:
-        for draw in entries:
-            weights = rng.normal(size=len(x))[:, None] / (count * (count - 1)) ** 0.5
-            draw += ((x * weights).T @ (batch * chart.inside)).T
-    own = replace(candidate.sums, entries=entries)
-    return replace(own, entries=own.symmetric.entries).fitted() if candidate.symmetric else own.fitted()
-
-
-def _projected(chart: Chart, errors: FloatArray, parts: Components) -> FloatArray:
-    """Return the part of errors, (draws, C, P) of orthonormal terms, that changes the mean or the components."""
-    root = np.sqrt(chart.weights * chart.share)
-    varying = errors[..., 1:].swapaxes(1, 2) * root
-    rest = varying - parts.field @ (parts.field.T @ varying)
-    rest = rest - (rest @ parts.cells.T) @ parts.cells
-    changed = np.divide(varying - rest, root, out=np.zeros_like(varying), where=root > 0)
-    return np.concatenate([errors[..., :1], changed.swapaxes(1, 2)], axis=2)
-
-
-def _needed(values: FloatArray, share: float, most: int) -> int:
-    """Return how many of the largest of rising values add up to a share of their sum."""
-    left: FloatArray = np.cumsum(values[::-1], dtype=np.float64)
-    return min(int(np.searchsorted(left, share * float(left[-1]))) + 1, most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,18 +74,13 @@ def fit_kernels(responses: Responses, camera: Camera, lens_type: LensType, pixel
     chart = chart_of(responses, designed, pixels)
     if chart is None:
         return KernelFit(False, "some pixels of the chart are dark")
-    candidate = choose(chart)
+    candidate = _chosen(chart)
     details, reason = _details(chart, candidate), ""
     if candidate.rejected:
         reason = f"the entries scatter more about the kernels than rays do ({', '.join(candidate.rejected)})"
     if candidate.shown > MOST_SHOWN or (candidate.rejected and candidate.unexplained > MOST_UNEXPLAINED):
         return KernelFit(False, reason, details=details)
-    parts = components(chart, candidate)
-    details["components"] = {
-        "count": len(parts.strengths),
-        "strengths": [float(each) for each in parts.strengths],
-    }
-    return KernelFit(True, reason, _footprints(chart, candidate, parts).times(float(lens_type.light)), details)
+    return KernelFit(True, reason, _footprints(chart, candidate).times(float(lens_type.light)), details)
 
 
 def refusal(camera: Camera, lens_type: LensType) -> str:
@@ -148,37 +98,156 @@ def refusal(camera: Camera, lens_type: LensType) -> str:
     return ""
 
 
-def _details(chart: Chart, candidate: Candidate) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A deviation of all rows, (C,), or None of the design.
+
+    chances : of each test;  excesses : of each test, the part of its sum of squares that is not noise, in units of the
+    noise
+    """
+
+    deviation: FloatArray | None
+    chances: dict[str, float]
+    excesses: dict[str, float]
+
+    @property
+    def rejected(self) -> list[str]:
+        """The tests that it does not pass."""
+        single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(self.chances))
+        return [name for name, value in self.chances.items() if value < single]
+
+    @property
+    def unexplained(self) -> float:
+        """Mean square of what it leaves of an entry beside noise, in units of the entry's variance."""
+        return self.excesses["all cells"]
+
+    @property
+    def shown(self) -> float:
+        """The largest excess of the tests of a picture that it does not pass, in units of the noise."""
+        return max((self.excesses[name] for name in self.rejected if name.endswith("picture")), default=0.0)
+
+
+def _chosen(chart: Chart) -> _Candidate:
+    """Return the mean deviation where it lowers the expected error and passes all tests, else the design if that does.
+
+    If neither passes, it is the one of the least expected error.
+    """
+    count = len(chart.batches)
+    mean = _fitted(chart, np.array([(each * chart.inside).sum(axis=0) for each in (chart.values, *chart.batches)]))
+    some = np.unique(np.linspace(0, len(chart.pixels) - 1, SHOWN_PIXELS).round().astype(np.int64))
+    shown = [float(np.square(chart.seen(each * chart.inside[some])).sum()) for each in mean]
+    learnt = shown[0] > 2 * sum(shown[1:]) / (count * (count - 1))  # the bias of the design, and the noise of the mean
+    best = _tested(chart, mean, learnt)
+    if not (learnt and best.rejected):
+        return best
+    designed = _tested(chart, mean, False)
+    return best if designed.rejected else designed
+
+
+def _fitted(chart: Chart, sums: FloatArray) -> FloatArray:
+    """Return the least squares of the cells, (k, C), from sums over the chart's pixels of entries that see them."""
+    seen = _symmetric(chart, np.square(chart.inside).sum(axis=0))
+    known = seen > SUPPORT * len(chart.pixels)
+    return np.divide(_symmetric(chart, sums), seen, out=np.zeros_like(sums), where=known)
+
+
+def _symmetric(chart: Chart, cells: FloatArray) -> FloatArray:
+    """Return the mean of cells, (..., C), and their images: mirrored, and transposed if pixels are open by squares."""
+    core, rings = np.split(cells, [chart.core**2], axis=-1)
+    grid = core.reshape(*cells.shape[:-1], chart.core, chart.core)
+    grid = (grid + grid[..., ::-1]) / 2
+    grid = (grid + grid[..., ::-1, :]) / 2
+    grid = (grid + grid.swapaxes(-1, -2)) / 2 if chart.is_square else grid
+    return np.concatenate([grid.reshape(core.shape), rings], axis=-1)
+
+
+def _tested(chart: Chart, mean: FloatArray, learnt: bool) -> _Candidate:
+    """Test what a deviation leaves, or the design. mean : (1 + B, C) of the mean and of the batches' deviations"""
+    heights: FloatArray = np.hypot(chart.field[:, 0], chart.field[:, 1])
+    rings: IntArray = np.searchsorted(np.quantile(heights, np.arange(1, RINGS) / RINGS), heights, side="right")
+    groups = {"sub-imagers": chart.sub_imagers, "field": rings}
+    members = {name: _members(index) for name, index in groups.items() if np.ptp(index)}
+    root, left, means = np.sqrt(chart.weights), list[FloatArray](), {name: list[FloatArray]() for name in members}
+    for entries, each in zip((chart.values, *chart.batches), mean, strict=True):
+        rest = entries - chart.inside * each if learnt else entries
+        left.append(rest * root)
+        for name, of in members.items():
+            means[name].append(of @ rest / np.sqrt(np.maximum(of @ chart.inside, 1.0)))
+    tests = {"all cells": _gram(left)}
+    for name, parts in means.items():
+        tests[name] = _gram([part * root for part in parts])
+        tests[f"{name} in a picture"] = _gram([chart.seen(part) for part in parts])
+    chances = {name: _chance(products) for name, products in tests.items()}
+    return _Candidate(mean[0] if learnt else None, chances, {name: _excess(each) for name, each in tests.items()})
+
+
+def _members(index: IntArray) -> FloatArray:
+    """Return 1 where a pixel is in a group, (groups, pixels)."""
+    return (index == np.unique(index)[:, None]).astype(np.float64)
+
+
+def _gram(parts: list[FloatArray]) -> FloatArray:
+    """Return the products of the mean's and of the batches' residuals, summed: (1 + B, 1 + B)."""
+    flat = [part.ravel() for part in parts]
+    return np.array([[np.dot(a, b) for b in flat] for a in flat], dtype=np.float64)
+
+
+def _chance(products: FloatArray) -> float:
+    """Return the probability of a sum of squares at least as large as that of the mean if only noise is in it.
+
+    An F test with the effective degrees of freedom of the noise, as of `freedom_of`.
+    """
+    noise, free = products[1:, 1:], len(products) - 2
+    trace, freedom = float(np.trace(noise)) / free, freedom_of(noise)
+    if trace <= 0:
+        return 1.0
+    return float(special.fdtrc(freedom, freedom * free, float(products[0, 0]) / (trace / (free + 1))))
+
+
+def _excess(products: FloatArray) -> float:
+    """Return the part of a sum of squares that is not noise, in units of the noise."""
+    free = len(products) - 2
+    noise = float(np.trace(products[1:, 1:])) / (free * (free + 1))
+    return float(products[0, 0]) / noise - 1 if noise > 0 else 0.0
+
+
+def _directions(chart: Chart, candidate: _Candidate) -> FloatArray:
+    """Return errors of the kernels, (E, C), each with an independent factor of variance 1."""
+    rng, count = probe(Purpose.KERNEL_ERRORS), len(chart.batches)
+    sums = np.zeros((DRAWS, chart.inside.shape[1]))
+    for batch in chart.batches:
+        sums += rng.normal(size=(DRAWS, len(chart.pixels))) @ (batch * chart.inside) / (count * (count - 1)) ** 0.5
+    errors = _fitted(chart, sums)
+    shown = chart.seen(errors * chart.share**0.5)
+    values, vectors = np.linalg.eigh(shown @ shown.T)
+    total = float(values.sum())
+    if total <= 0:
+        return errors[:0]
+    left: FloatArray = np.cumsum(values[::-1], dtype=np.float64)
+    kept = min(int(np.searchsorted(left, SHARE * total)) + 1, MOST_DIRECTIONS)
+    scale = ((1 + candidate.shown) * total / values[-kept:].sum() / DRAWS) ** 0.5
+    return np.asarray(vectors[:, -kept:].T * scale @ errors, dtype=np.float64)
+
+
+def _details(chart: Chart, candidate: _Candidate) -> dict[str, Any]:
     return {
         "lens": chart.places.lens_type.name,
         "pixels": len(chart.pixels),
         "rays_per_pixel": chart.rays,
         "width": chart.places.width,
         "core": chart.core,
-        "as_designed": candidate.as_designed,
-        "degree": candidate.degree,
-        "symmetric": candidate.symmetric,
+        "as_designed": candidate.deviation is None,
         "chances": candidate.chances,
         "unexplained": candidate.unexplained,
     }
 
 
-def _footprints(chart: Chart, candidate: Candidate, parts: Components) -> KernelFootprints:
-    """Return H from the kernels of the design, the mean deviation and its components."""
-    designed, root = chart.designed, np.sqrt(chart.weights * chart.share)
-    orthonormal = candidate.coefficients[0] @ parts.triangle
-    back = np.linalg.inv(parts.triangle)
-    varying = np.divide(parts.cells, root, out=np.zeros_like(parts.cells), where=root > 0)
-    shares = np.concatenate(
-        [np.zeros((1, len(parts.strengths))), parts.field * (parts.strengths / len(chart.pixels) ** 0.5)]
-    )
-    learnt = np.concatenate([orthonormal[None, :, 0], varying])
-    coefficients = np.concatenate([np.eye(1, len(back)), shares.T]) @ back
-    if candidate.as_designed:
-        learnt, coefficients = learnt[:0], coefficients[:0]
-    errors, error_coefficients = error_directions(chart, candidate, parts)
+def _footprints(chart: Chart, candidate: _Candidate) -> KernelFootprints:
+    """Return H from the kernels of the design and the mean deviation."""
+    designed, errors = chart.designed, _directions(chart, candidate)
+    learnt = errors[:0] if candidate.deviation is None else candidate.deviation[None]
     (core, rings), (error_core, error_rings) = (np.split(each, [chart.core**2], axis=1) for each in (learnt, errors))
-    square = -1, chart.core, chart.core
+    square, terms = (-1, chart.core, chart.core), designed.coefficients.shape[1]
     shapes = replace(
         designed.shapes,
         core=core.reshape(square),
@@ -186,11 +255,7 @@ def _footprints(chart: Chart, candidate: Candidate, parts: Components) -> Kernel
         error_core=error_core.reshape(square),
         error_rings=error_rings,
     )
-    degree = max(designed.degree, candidate.degree)
-    count = len(terms(degree))  # in the order of their degrees
-    known, learnt_terms, error_terms = (
-        np.pad(each, [(0, 0)] * (each.ndim - 1) + [(0, count - each.shape[-1])])
-        for each in (designed.coefficients, coefficients, error_coefficients)
-    )
-    coefficients = np.concatenate([known, learnt_terms])
-    return KernelFootprints(designed.places, degree, shapes.rounded, coefficients, error_terms)
+    even = np.eye(1, terms)  # the constant term alone
+    coefficients = np.concatenate([designed.coefficients, *[even] * len(learnt)])
+    error_terms = np.eye(len(errors))[:, :, None] * even
+    return KernelFootprints(designed.places, designed.degree, shapes.rounded, coefficients, error_terms)

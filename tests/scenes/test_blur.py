@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
 from ommatid.scenes.lens_type import LensOptics
-from ommatid.scenes.optics.field import FINEST, field_of
+from ommatid.scenes.optics.field import FINEST, optics_of
 from ommatid.scenes.optics.lens_kernels import blurred_matrix, kernels
 from ommatid.scenes.optics.lens_matrix import matrix, row_by_rays, row_by_waves
 from ommatid.scenes.optics.point_spread import point_spread
@@ -38,7 +38,7 @@ def with_lens_optics(optics: LensOptics, wavelength: float | None = None, ratio:
 def test_rays_through_the_rim_of_the_lens_land_on_the_rim_of_the_disk() -> None:
     """The ray from s through the lens point a meets -s focus / depth in the plane in focus."""
     cam = with_lens_optics(LensOptics(aperture=0.4, focus=800.0))
-    field, s, depth = field_of(cam, cam.types[0], None), 0.07, cam.depth(cam.types[0])
+    field, s, depth = optics_of(cam, cam.types[0], None), 0.07, cam.depth(cam.types[0])
     landed = [a + (-s * 800 / depth - a) * cam.distance / 800 for a in (-0.2, 0.2)]
     rays = field.wave(s, None)
     assert rays is not None
@@ -50,7 +50,7 @@ def test_rays_through_the_rim_of_the_lens_land_on_the_rim_of_the_disk() -> None:
 
 def test_the_first_dark_ring_is_at_1_22_wavelengths_over_the_aperture() -> None:
     cam = with_lens_optics(LensOptics(aperture=0.4), wavelength=550e-6)
-    field = field_of(cam, cam.types[0], 550e-6)
+    field = optics_of(cam, cam.types[0], 550e-6)
     spread = point_spread(field.lit_wave(0.0), field.grid)
     dark = AIRY_FIRST_ZERO * GREEN / 0.4 * 1000
     near = np.abs(spread.offsets - dark) < 0.5 * dark

@@ -14,7 +14,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.optics import spectrum
-from ommatid.scenes.optics.field import field_of
+from ommatid.scenes.optics.field import optics_of
 from ommatid.scenes.optics.point_spread import point_spread
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.scene import Scene, parse, read, with_changes, write
@@ -137,7 +137,7 @@ def test_axial_colour_takes_more_wavelengths(wavelengths: int) -> None:
     frequency = camera.depth(lens) / camera.distance / camera.pixel_pitch  # that of sensor pixels, on the target
 
     def contrast(places: FloatArray, shares: FloatArray) -> FloatArray:
-        waves = [field_of(camera, lens, float(at)).lit_wave(0.0) for at in places]
+        waves = [optics_of(camera, lens, float(at)).lit_wave(0.0) for at in places]
         return shares @ [
             point_spread(wave).transfer(np.array([[0.5, 0], [0.75, 0]]) * frequency).real for wave in waves
         ]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import sparse, stats
 
-from ommatid.scenes.optics.field import TOLERANCE, field_of
+from ommatid.scenes.optics.field import TOLERANCE, optics_of
 from ommatid.scenes.optics.point_spread import density, grid_of, point_spread
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.responses import measured
@@ -65,7 +65,7 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     surfaces, wavelength, more = CASES[kind]
     setup = setup_of(surfaces, wavelength, **more)
     traced = measured(setup, by_points=False)
-    lens = field_of(setup.camera, setup.camera.types[0], None)
+    lens = optics_of(setup.camera, setup.camera.types[0], None)
     # Rays alone leave through the whole exit disk; those that the lens blocks do not count.
     lit = float(lens.lit_share(np.zeros(1))[0]) if wavelength == "none" else 1.0
     found = scores(traced.matrix, ideal_matrix(setup.camera), traced.passes * traced.samples * lit)
@@ -77,7 +77,7 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
 def test_an_entry_is_the_integral_of_the_point_spread_over_pixel_and_texel() -> None:
     """By brute force: densities at points of the target around one pixel's mean, times the overlaps."""
     camera = setup_of(BENT, "550 nm").camera
-    lens = field_of(camera, camera.types[0], camera.wavelength)
+    lens = optics_of(camera, camera.types[0], camera.wavelength)
     row = ideal_matrix(camera)[[0]].toarray().reshape(camera.shape)
     (sub, *_) = camera.sub_imagers
     x, y = (sub.patch[axis] - sub.lens[axis] - camera.pixel_pitch for axis in (0, 1))
@@ -88,7 +88,7 @@ def test_an_entry_is_the_integral_of_the_point_spread_over_pixel_and_texel() -> 
     across, up = (np.asarray(axis, dtype=np.float64) for axis in np.meshgrid(offsets, offsets))
     light = density(wave, across.ravel(), up.ravel()).reshape(across.shape) * step**2
     half = np.array([-camera.pixel_pitch, camera.pixel_pitch]) / 2
-    edges_x, edges_y = lens.centre(x + half, np.array([y, y]))[0], lens.centre(np.array([x, x]), y + half)[1]
+    edges_x, edges_y = lens.chief_ray(x + half, np.array([y, y]))[0], lens.chief_ray(np.array([x, x]), y + half)[1]
     columns = camera.columns / 2 - (sub.lens[0] + edges_x[:, None] + offsets) / pitch
     rows = camera.rows / 2 - (sub.lens[1] + edges_y[:, None] + offsets) / pitch
 
@@ -137,7 +137,7 @@ def test_rows_add_up_to_the_light_that_the_target_sends() -> None:
 def test_waves_on_a_grid_wider_than_their_own() -> None:
     """As for the middle of a field whose corner is blurred: the same light within its own, and never more than all."""
     setup = setup_of(FLAT, "550 nm")
-    lens = field_of(setup.camera, setup.camera.types[0], setup.camera.wavelength)
+    lens = optics_of(setup.camera, setup.camera.types[0], setup.camera.wavelength)
     near = lens.wave(0.0, lens.wavelength)
     assert near is not None
     cell, half = grid_of(near)

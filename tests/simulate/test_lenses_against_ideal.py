@@ -14,7 +14,7 @@ import pytest
 from scipy import sparse, stats
 
 from ommatid.runtime.arrays import FloatArray
-from ommatid.scenes.optics.field import field_of
+from ommatid.scenes.optics.field import optics_of
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibration.ray_transport import one_pass
 from ommatid.simulate.calibration.responses import measured
@@ -91,7 +91,7 @@ def test_the_focus_has_these_waves(kind: str) -> None:
     _, camera = with_optics(*CLOSED[kind])
     lens = camera.types[0]
     vergence = 1 / camera.distance_of(lens) - 1 / camera.focus(lens)
-    waves = field_of(camera, lens, camera.wavelength).waves_of(vergence)
+    waves = optics_of(camera, lens, camera.wavelength).waves_of(vergence)
     assert abs(waves) == pytest.approx(float(kind.split()[0]), rel=1e-3)
 
 

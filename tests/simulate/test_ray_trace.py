@@ -16,7 +16,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import derive
 from ommatid.scenes.lens_type import LensOptics
 from ommatid.scenes.optics import sharpness
-from ommatid.scenes.optics.field import exit_disk_of, field_of, prescription_of, reach
+from ommatid.scenes.optics.field import exit_disk_of, optics_of, prescription_of, reach
 from ommatid.scenes.optics.prescription import Prescription, prescribe
 from ommatid.scenes.optics.ray_trace import (
     NUMPY,
@@ -191,7 +191,7 @@ def test_a_camera_s_lenses_collect_what_their_f_numbers_say() -> None:
     camera = derive(read(GALLERY / "doublet.toml", (), ["I", "III"]))
     reported = {one["lens"]: one["working_f_number"] for one in sharpness.describe(camera)}
     for lens_type in camera.types:
-        angle = field_of(camera, lens_type, None).brightness(np.zeros(1))[0]
+        angle = optics_of(camera, lens_type, None).weight(np.zeros(1))[0]
         assert angle == pytest.approx(pi / (4 * reported[lens_type.name] ** 2), rel=0.015)
     data = [
         'target.distance="20 mm"',
@@ -199,10 +199,10 @@ def test_a_camera_s_lenses_collect_what_their_f_numbers_say() -> None:
         ' {radius="-2 mm", semi_diameter="75 um"}]',
     ]
     camera = derive(read(GALLERY / "tile19.toml", data, ["I"]))
-    field = field_of(camera, camera.types[0], None)
+    field = optics_of(camera, camera.types[0], None)
     height = np.linspace(0, field.field, 9)
     assert field.field / field.depth > 0.4
-    light = field.brightness(height)
+    light = field.weight(height)
     np.testing.assert_allclose(light / light[0], (1 + (height / field.depth) ** 2) ** -2, rtol=0.01)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.lens_file import read_lens
-from ommatid.scenes.optics.field import LensField, field_of
+from ommatid.scenes.optics.field import Optics, optics_of
 from ommatid.scenes.optics.point_spread import point_spread, relative_intensity, strehl_ratio
 from ommatid.scenes.scene import parse, read
 
@@ -28,7 +28,7 @@ SMALL_PIXELS = ["camera.pixel_pitch=6 um", "camera.lens_pitch=0.5 mm"]  # lenses
 
 
 @cache
-def field(name: str, wavelength: float) -> LensField:
+def field(name: str, wavelength: float) -> Optics:
     scene = read(GALLERY / f"{'planoconvex' if name == ASPHERE else name}.toml", SMALL_PIXELS)
     if name == ASPHERE:
         data = scene.plain()
@@ -37,7 +37,7 @@ def field(name: str, wavelength: float) -> LensField:
             table["surfaces"] = asphere()
         scene = parse(data, Path("test.toml"))
     camera = derive(scene)
-    return field_of(camera, camera.types[0], wavelength)
+    return optics_of(camera, camera.types[0], wavelength)
 
 
 def asphere() -> list[dict[str, Any]]:

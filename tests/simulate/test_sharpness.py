@@ -12,7 +12,7 @@ import pytest
 from ommatid.analysis.lens_table import lens_rows
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.optics import sharpness
-from ommatid.scenes.optics.field import field_of
+from ommatid.scenes.optics.field import optics_of
 from ommatid.scenes.optics.point_spread import point_spread
 from ommatid.scenes.scene import parse, read
 
@@ -61,7 +61,7 @@ def test_the_given_distortion_is_reported_where_the_sensor_ends() -> None:
     camera = derive(read(GALLERY / "distorted.toml", ["camera.lens.I.aperture=0.1 mm", "camera.lens_pitch=1 mm"]))
     (found,) = sharpness.describe(camera)
     kind = camera.types[0]
-    field, (k1, k2) = field_of(camera, kind, None), kind.optics.distortion or (0.0, 0.0)
+    field, (k1, k2) = optics_of(camera, kind, None), kind.optics.distortion or (0.0, 0.0)
     image = field.field / camera.depth(kind) * camera.distance / camera.half_diagonal
     radius = np.linspace(0, image, 200_001)
     at = float(np.interp(image, radius * (1 + k1 * radius**2 + k2 * radius**4), radius))
@@ -81,7 +81,7 @@ def test_the_field_of_a_thin_single_lens_is_curved_as_the_third_order_says() -> 
     data["camera"]["lens"][0]["surfaces"] = rows
     camera = derive(parse(data, Path("test.toml")))
     (found,) = sharpness.describe(camera)
-    field = field_of(camera, camera.types[0], None)
+    field = optics_of(camera, camera.types[0], None)
     expected = -(field.field**2) / (2 * field.focal_length) * (2 + 1 / 1.5)
     assert found["curvature"] == pytest.approx(expected, rel=0.03)
     assert abs(found["distortion"]) < 1e-3
@@ -133,7 +133,7 @@ def test_a_lens_of_surfaces_through_focus_agrees_with_waves_traced_to_a_moved_se
     kind = camera.types[0]
     curve = sharpness.through_focus(camera)[0]
     for number in (5, 8, 12):
-        moved = replace(field_of(camera, kind, camera.wavelength), depth=camera.depth(kind) + curve.shifts[number])
+        moved = replace(optics_of(camera, kind, camera.wavelength), depth=camera.depth(kind) + curve.shifts[number])
         frequency = moved.depth / camera.distance / (4 * camera.pixel_pitch)  # which stays as it is on the sensor
         along = np.array([[frequency, 0.0], [0.0, frequency]])
         for height, contrast in ((0.0, curve.axis), (moved.field, curve.rim)):

@@ -1,6 +1,6 @@
 """What one lens type does over its field: where rays go, how much light passes, and how points blur.
 
-A kind of lens is a class that yields the wave of a sensor point: `ThinField` and `SurfaceField`. All else follows. A
+A kind of lens is a class that yields the wave of a sensor point: `ThinOptics` and `SurfaceOptics`. All else follows. A
 pinhole whose pixels blur is a thin lens in focus, through which light goes as rays.
 Lengths are millimetres, in the coordinates of the lens. The lens is round, so that everything depends on the height of
 the sensor point above the axis; point-spread functions turn with its direction. They are computed at nodes of height,
@@ -47,7 +47,7 @@ PINHOLE = 1e-3  # of the depth: an aperture in its place, in focus
 
 
 @dataclass(frozen=True, eq=False)
-class LensField(ABC):
+class Optics(ABC):
     """One lens type at one wavelength.
 
     distance : of the target from the front principal plane;  depth : of the sensor behind the rear one
@@ -79,7 +79,7 @@ class LensField(ABC):
 
     def lit_share(self, height: FloatArray) -> FloatArray:
         """Return the mean weight, cos^4 or 0 where they are blocked, of rays that go evenly spread through the lens."""
-        return self.brightness(height) / self.cone
+        return self.weight(height) / self.cone
 
     def rays(self, height: float, finest: float) -> Wavefront:
         """Return the rays of a sensor point that gets light, as many as resolve a period on the target."""
@@ -95,20 +95,20 @@ class LensField(ABC):
         return np.array([height for height, _ in lit]), [wave for _, wave in lit]
 
     @cached_property
-    def _centres(self) -> CubicSpline:
+    def _chief_rays(self) -> CubicSpline:
         heights, waves = self._rays
         middles = np.array([wave.centre[1] for wave in waves])
         # The height on the target is an odd function of the height on the sensor.
         return CubicSpline(np.append(-heights[:0:-1], heights), np.append(-middles[:0:-1], middles))
 
-    def centre(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def chief_ray(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the middle of the light of sensor points on the target, from the lens's axis."""
         height = np.hypot(x, y)
         limited = np.clip(height, 1e-9 * self.field, self._rays[0][-1])
-        scale = self._centres(limited) / limited
+        scale = self._chief_rays(limited) / limited
         return x * scale, y * scale
 
-    def brightness(self, height: FloatArray) -> FloatArray:
+    def weight(self, height: FloatArray) -> FloatArray:
         """Return the light at sensor points as a projected solid angle, sr; 0 where none arrives."""
         heights, waves = self._rays
         return np.interp(height, heights, [wave.brightness for wave in waves], right=0.0)
@@ -229,24 +229,24 @@ class LensField(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceField(LensField):
+class SurfaceOptics(Optics):
     """A lens of surfaces; disk : through which rays leave towards the sensor."""
 
     prescription: Prescription
     disk: Disk
 
     def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
-        """Trace the wave through the surfaces; see `LensField.wave`."""
+        """Trace the wave through the surfaces; see `Optics.wave`."""
         return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, half)
 
     @property
     def cone(self) -> float:
-        """Of the exit disk; see `LensField.cone`."""
+        """Of the exit disk; see `Optics.cone`."""
         return pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2
 
 
 @dataclass(frozen=True, eq=False)
-class ThinField(LensField):
+class ThinOptics(Optics):
     """A thin lens; aperture : its diameter;  focus : distance of the target that would be sharp."""
 
     aperture: float
@@ -254,16 +254,16 @@ class ThinField(LensField):
     most_rings: ClassVar[float] = MOST_THIN_RINGS
 
     def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
-        """Compute the wave, whose phase is quadratic; see `LensField.wave`."""
+        """Compute the wave, whose phase is quadratic; see `Optics.wave`."""
         return thin_wavefront(self.aperture, self.depth, height, self.distance, self.focus, wavelength, half)
 
     @property
     def cone(self) -> float:
-        """Of the aperture; see `LensField.cone`."""
+        """Of the aperture; see `Optics.cone`."""
         return pi * (self.aperture / 2 / self.depth) ** 2
 
     def rays(self, height: float, finest: float) -> Wavefront:
-        """Return the rays of a sensor point; see `LensField.rays`."""
+        """Return the rays of a sensor point; see `Optics.rays`."""
         return thin_wavefront(self.aperture, self.depth, height, self.distance, self.focus, None, finest=finest)
 
 
@@ -296,7 +296,7 @@ class SamplingTables:
         return self.densities * np.sqrt(1 + (place[:, None] ** 2 + place**2) / self.spot**2)
 
 
-def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: float) -> SamplingTables:
+def sampling_tables(field: Optics, vergences: FloatArray, cells: int, reach: float) -> SamplingTables:
     """Return the densities of slopes of a lens for targets at vergences, which rise.
 
     Offsets drawn from densities that are linear between the points are a convolution with a tent of two cells. It damps
@@ -324,7 +324,7 @@ def sampling_tables(field: LensField, vergences: FloatArray, cells: int, reach: 
     return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)), bright)
 
 
-def check_waves(lens_type: LensType, field: LensField) -> None:
+def check_waves(lens_type: LensType, field: Optics) -> None:
     """Raise InputError for aberrations of so many waves that the light can be computed neither as waves nor as rays."""
     if field.aberrated_rays:
         raise InputError(
@@ -342,9 +342,9 @@ def bands(camera: Camera) -> tuple[tuple[float | None, float], ...]:
 def light_reach(camera: Camera, lens_type: LensType) -> float:
     """Return how far light reaches beyond a pixel's footprint, in pixels of f.
 
-    Raises InputError for more than can be computed, and as `field_of` does.
+    Raises InputError for more than can be computed, and as `optics_of` does.
     """
-    far = max(field_of(camera, lens_type, wavelength).reach for wavelength, _ in bands(camera)) / camera.target_pitch
+    far = max(optics_of(camera, lens_type, wavelength).reach for wavelength, _ in bands(camera)) / camera.target_pitch
     far += DEVIATIONS * camera.diffusion(lens_type)
     if far > MOST_REACH:
         raise InputError(
@@ -355,13 +355,13 @@ def light_reach(camera: Camera, lens_type: LensType) -> float:
 
 
 @lru_cache(maxsize=32)
-def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> LensField:
+def optics_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> Optics:
     """Return a lens type of the camera at a wavelength.
 
-    Raises InputError for a cone of light that no lens in air forms, and as `surface_field` does.
+    Raises InputError for a cone of light that no lens in air forms, and as `_surface_optics` does.
     """
     if lens_type.optics.surfaces is not None:
-        return surface_field(camera, lens_type, wavelength)
+        return _surface_optics(camera, lens_type, wavelength)
     depth, (far, _, _), aperture = camera.depth(lens_type), reach(camera, lens_type), lens_type.optics.aperture
     if aperture is None:
         aperture, wavelength = PINHOLE * depth, None
@@ -370,7 +370,7 @@ def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> L
             f"camera.lens.{lens_type.name}.aperture: expected a cone of light of f/{FASTEST:g} at the sensor or"
             f" narrower, the limit of lenses in air, got f/{depth / aperture:.2g}; make the aperture smaller"
         )
-    return ThinField(
+    return ThinOptics(
         depth=depth,
         distance=camera.distance_of(lens_type),
         field=far,
@@ -383,8 +383,7 @@ def field_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> L
     )
 
 
-@lru_cache(maxsize=16)
-def surface_field(camera: Camera, lens_type: LensType, wavelength: float | None) -> SurfaceField:
+def _surface_optics(camera: Camera, lens_type: LensType, wavelength: float | None) -> SurfaceOptics:
     """Return a lens type of surfaces at a wavelength.
 
     The lens is scaled and placed as at the camera's wavelength; another one changes the glass alone, so that principal
@@ -398,7 +397,7 @@ def surface_field(camera: Camera, lens_type: LensType, wavelength: float | None)
         distance += other.front_principal - lens.front_principal
         lens = other
     pupil = lens.entrance_pupil
-    return SurfaceField(
+    return SurfaceOptics(
         depth=depth,
         distance=distance,
         field=far,

@@ -24,7 +24,7 @@ from ..camera import Camera
 from ..fitted.kernel_shapes import KernelShapes
 from ..fitted.kernels import KernelFootprints, KernelPlaces, basis, terms
 from ..lens_type import LensType
-from .field import FINEST, LensField, bands, check_waves, field_of, light_reach
+from .field import FINEST, Optics, bands, check_waves, light_reach, optics_of
 from .lens_matrix import blur_of, matrix, row_by_rays, row_by_waves
 from .point_spread import point_spread
 
@@ -43,7 +43,7 @@ class _FieldRows:
     """Rows of H of a lens type at any position of its field, on W x W pixels of f."""
 
     places: KernelPlaces
-    fields: tuple[tuple[LensField, float], ...]
+    fields: tuple[tuple[Optics, float], ...]
 
     def at(self, u: float, v: float) -> FloatArray:
         """Return the row at (u, v) of the field: (W, W)."""
@@ -51,7 +51,7 @@ class _FieldRows:
         total, light = np.zeros((self.places.width, self.places.width)), 0.0
         for field, weight in self.fields:
             x, y = beside[::-1] * self._pitch
-            lit = weight * float(field.brightness(np.array([np.hypot(x, y)]))[0])
+            lit = weight * float(field.weight(np.array([np.hypot(x, y)]))[0])
             if lit > 0:
                 total += lit * self._row(field, float(x), float(y), beside)
             light += lit
@@ -63,7 +63,7 @@ class _FieldRows:
         camera = self.places.camera
         return camera.target_pitch * camera.optical_magnification(self.places.lens_type)
 
-    def _row(self, field: LensField, x: float, y: float, beside: FloatArray) -> FloatArray:
+    def _row(self, field: Optics, x: float, y: float, beside: FloatArray) -> FloatArray:
         camera, lens_type, wide = self.places.camera, self.places.lens_type, self.places.width
         edges = tuple(_edges(camera, field, x, y, lens_type) - (beside - wide / 2)[:, None])
         blur, pitch, height = blur_of(camera, lens_type), camera.target_pitch, float(np.hypot(x, y))
@@ -90,10 +90,10 @@ def _nodes(count: int) -> FloatArray:
     return (1 + np.polynomial.legendre.leggauss(count)[0]) / 2
 
 
-def _edges(camera: Camera, field: LensField, x: float, y: float, lens_type: LensType) -> FloatArray:
+def _edges(camera: Camera, field: Optics, x: float, y: float, lens_type: LensType) -> FloatArray:
     """Return the edges of a footprint in pixels of f from the lens's axis, by rows and by columns: (2, 2)."""
     tall, wide = (camera.pixel_pitch / 2 * float(part) * np.array([-1.0, 1.0]) for part in lens_type.open)
-    across, down = field.centre(x + wide, np.full(2, y))[0], field.centre(np.full(2, x), y + tall)[1]
+    across, down = field.chief_ray(x + wide, np.full(2, y))[0], field.chief_ray(np.full(2, x), y + tall)[1]
     return -np.stack([down, across]) / camera.target_pitch
 
 
@@ -104,7 +104,7 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
     Expects a camera for which `Camera.has_kernel` is true. Raises InputError if surfaces form no image, if kernels do
     not hold the variation over the field to the tolerance, and as `light_reach` does.
     """
-    fields = tuple((field_of(camera, lens_type, wavelength), weight) for wavelength, weight in bands(camera))
+    fields = tuple((optics_of(camera, lens_type, wavelength), weight) for wavelength, weight in bands(camera))
     for field, _ in fields:
         check_waves(lens_type, field)
     rows = _FieldRows(KernelPlaces(camera, lens_type, _margin(camera, lens_type, fields)), fields)
@@ -138,7 +138,7 @@ def blurred_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     return matrix(camera, lens_type)
 
 
-def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[LensField, float], ...]) -> int:
+def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[Optics, float], ...]) -> int:
     """Return by how many pixels of f light reaches beyond a footprint, distortion included."""
     places = KernelPlaces(camera, lens_type, 0)
     corner = np.array(places.extent) * places.scale

@@ -31,7 +31,7 @@ from ..camera import Camera
 from ..constants import DEVIATIONS
 from ..lens_type import LensType
 from ..pose import corner_offset, pose_of
-from .field import LensField, bands, check_waves, field_of
+from .field import Optics, bands, check_waves, optics_of
 from .wavefront import Wavefront
 
 SAME = 6  # digits of edges of footprints, which pixels of a row share
@@ -75,14 +75,14 @@ def _band(
     camera: Camera, lens_type: LensType, wavelength: float | None, weight: float
 ) -> tuple[sparse.csr_array, FloatArray]:
     """Return H at one wavelength times the light of each pixel, and this light, whose share in all is `weight`."""
-    field = field_of(camera, lens_type, wavelength)
+    field = optics_of(camera, lens_type, wavelength)
     check_waves(lens_type, field)
     pixels = _pixels(camera, lens_type, field)
-    light = weight * field.brightness(np.hypot(pixels.x, pixels.y))
+    light = weight * field.weight(np.hypot(pixels.x, pixels.y))
     return sparse.csr_array(sparse.diags_array(light) @ _rows(camera, field, pixels)), light
 
 
-def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _PixelFootprints:
+def _pixels(camera: Camera, lens_type: LensType, field: Optics) -> _PixelFootprints:
     parts: list[FloatArray] = []
     tall, wide = (camera.pixel_pitch / 2 * float(part) for part in lens_type.open)
     for sub in camera.sub_imagers:
@@ -93,8 +93,8 @@ def _pixels(camera: Camera, lens_type: LensType, field: LensField) -> _PixelFoot
         u, v = corner_offset(camera, sub)
         points = pose.axes @ np.stack([u + column * camera.pixel_pitch, v + row * camera.pixel_pitch])
         x, y, _ = pose.middle[:, None] + points
-        left, right = (sub.lens[0] + field.centre(x + step, y)[0] for step in (-wide, wide))
-        upper, lower = (sub.lens[1] + field.centre(x, y + step)[1] for step in (-tall, tall))
+        left, right = (sub.lens[0] + field.chief_ray(x + step, y)[0] for step in (-wide, wide))
+        upper, lower = (sub.lens[1] + field.chief_ray(x, y + step)[1] for step in (-tall, tall))
         columns = [camera.columns / 2 - edge / camera.target_pitch for edge in (left, right)]
         rows = [camera.rows / 2 - edge / camera.target_pitch for edge in (upper, lower)]
         parts.append(np.stack([x, y, *rows, *columns]))
@@ -108,14 +108,14 @@ def blur_of(camera: Camera, lens_type: LensType) -> tuple[float, float]:
     return deviation / float(lens_type.open[0]), deviation / float(lens_type.open[1])
 
 
-def _rows(camera: Camera, field: LensField, pixels: _PixelFootprints) -> sparse.csr_array:
+def _rows(camera: Camera, field: Optics, pixels: _PixelFootprints) -> sparse.csr_array:
     count = pixels.x.size
     own = float(np.ptp(pixels.rows[0])) * (1 + 2 * DEVIATIONS * pixels.blur[0])
     side = [min(size, own + 2 * field.reach / camera.target_pitch + 2) for size in camera.shape]
     needed = int(count * side[0] * side[1]) * ENTRY
     check_memory(needed, "H of blurred pixels", "crop the target or use fewer sub-imagers")
     rows: list[sparse.csr_array] = [sparse.csr_array((1, camera.unknowns))] * count
-    lit = np.flatnonzero(field.brightness(np.hypot(pixels.x, pixels.y)) > 0)
+    lit = np.flatnonzero(field.weight(np.hypot(pixels.x, pixels.y)) > 0)
     by_points = _by_rays if field.rays_suffice else _by_waves
     for pixel, values in by_points(camera, field, pixels, lit):
         values[values < LEAST] = 0.0
@@ -124,7 +124,7 @@ def _rows(camera: Camera, field: LensField, pixels: _PixelFootprints) -> sparse.
 
 
 def _by_rays(
-    camera: Camera, field: LensField, pixels: _PixelFootprints, lit: IntArray
+    camera: Camera, field: Optics, pixels: _PixelFootprints, lit: IntArray
 ) -> Iterator[tuple[int, FloatArray]]:
     """Compute the entries, (rows, columns) of f, of each lit pixel from the rays of the nodes beside its height."""
     for pixel in lit.tolist():
@@ -137,7 +137,7 @@ def _by_rays(
 
 
 def _by_waves(
-    camera: Camera, field: LensField, pixels: _PixelFootprints, lit: IntArray
+    camera: Camera, field: Optics, pixels: _PixelFootprints, lit: IntArray
 ) -> Iterator[tuple[int, FloatArray]]:
     """Compute the entries, (rows, columns) of f, of each lit pixel; pixels with one point-spread function in turn."""
     cell, levels = field.grid[0] / camera.target_pitch, [max(steps, 1) for steps in field.steps]
@@ -155,7 +155,7 @@ def _by_waves(
             yield pixel, row_by_waves(turned, cell, edges, pixels.blur, camera.shape)
 
 
-def _key(field: LensField, x: float, y: float) -> tuple[int, int]:
+def _key(field: Optics, x: float, y: float) -> tuple[int, int]:
     """Return the level of direction, folded into the half quadrant beside the y axis, and of height, of a pixel."""
     levels, turns = field.steps
     angle = float(np.arctan2(min(abs(x), abs(y)), max(abs(x), abs(y))))

@@ -118,10 +118,10 @@ def electrons(scene: Scene, camera: Camera) -> FloatArray:
 
 def _through_surfaces(camera: Camera, sub: SubImager, pose: Pose) -> FloatArray:
     """Projected solid angle, sr, of a lens with surfaces at each pixel of a sub-imager, (its pixels,), by its rays."""
-    from .field import field_of
+    from .field import optics_of
 
     points = _pixel_places(camera, sub, pose)[0]
-    return field_of(camera, sub.type, None).brightness(np.hypot(points[..., 0], points[..., 1]).ravel())
+    return optics_of(camera, sub.type, None).weight(np.hypot(points[..., 0], points[..., 1]).ravel())
 
 
 def transmissions(camera: Camera) -> dict[str, float]:

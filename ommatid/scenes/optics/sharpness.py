@@ -24,7 +24,7 @@ from ..constants import AIRY_FIRST_ZERO, GREEN
 from ..geometry.optical_terms import ThroughFocus
 from ..lens_type import LensType
 from . import distortion
-from .field import LEAST_VERGENCE, LensField, field_of
+from .field import LEAST_VERGENCE, Optics, optics_of
 from .point_spread import grid_of, point_spread, strehl_ratio
 from .wavefront import Wavefront
 
@@ -69,7 +69,7 @@ def depth_of_field(
 
 
 def _described(camera: Camera, lens_type: LensType) -> dict[str, Any]:
-    rays, depth = field_of(camera, lens_type, None), camera.depth(lens_type)
+    rays, depth = optics_of(camera, lens_type, None), camera.depth(lens_type)
     (diameter, before), vergence = rays.entrance_pupil, 1 / rays.focal_length - 1 / depth
     near, far = depth_of_field(depth, vergence, diameter, camera.pixel_pitch, before)
     airy = 2 * AIRY_FIRST_ZERO * (camera.wavelength or GREEN) * rays.working_f_number
@@ -92,14 +92,14 @@ def _described(camera: Camera, lens_type: LensType) -> dict[str, Any]:
         **{f"{name}_axis": value for name, value in axis.items()},
         **{f"{name}_rim": value for name, value in rim.items()},
         "distortion": None if rim["spot"] is None else _distortion(camera, lens_type, rays),
-        "illumination": float(rays.brightness(np.array([rays.field]))[0] / rays.brightness(np.zeros(1))[0]),
+        "illumination": float(rays.weight(np.array([rays.field]))[0] / rays.weight(np.zeros(1))[0]),
     }
 
 
 def _at_height(camera: Camera, lens_type: LensType, height: float) -> dict[str, float | None]:
     """Return spot, wavefront error, Strehl ratio and contrast at a height of the sensor point."""
     wavelength = camera.wavelength
-    field = field_of(camera, lens_type, wavelength)
+    field = optics_of(camera, lens_type, wavelength)
     rays = field.wave(height, None)
     wave = None if wavelength is None or rays is None or field.rays_suffice else field.wave(height, wavelength)
     return {
@@ -110,7 +110,7 @@ def _at_height(camera: Camera, lens_type: LensType, height: float) -> dict[str, 
     }
 
 
-def _contrast(camera: Camera, field: LensField, wave: Wavefront, grid: tuple[float, float] | None = None) -> float:
+def _contrast(camera: Camera, field: Optics, wave: Wavefront, grid: tuple[float, float] | None = None) -> float:
     """Return the modulation transfer at half the sensor's Nyquist frequency, of the worse direction."""
     frequency = field.depth / field.distance / (4 * camera.pixel_pitch)  # on the target
     return float(point_spread(wave, grid).transfer(np.array([[frequency, 0.0], [0.0, frequency]])).min())
@@ -122,7 +122,7 @@ def through_focus(camera: Camera) -> list[ThroughFocus]:
     for lens_type in camera.types:
         if not lens_type.optics.has_width or camera.wavelength is None:
             continue
-        field, depth = field_of(camera, lens_type, camera.wavelength), camera.depth(lens_type)
+        field, depth = optics_of(camera, lens_type, camera.wavelength), camera.depth(lens_type)
         if field.rays_suffice or field.wave(field.field, None) is None:
             continue
         number = field.working_f_number
@@ -133,7 +133,7 @@ def through_focus(camera: Camera) -> list[ThroughFocus]:
     return curves
 
 
-def _contrasts(camera: Camera, field: LensField, height: float, vergences: FloatArray) -> FloatArray:
+def _contrasts(camera: Camera, field: Optics, height: float, vergences: FloatArray) -> FloatArray:
     """Return the contrast of a lit sensor point at changes of its vergence: a quadratic phase over the pupil."""
     rays = field.outline(height)
     blur = field.pupil_radius * field.distance * float(np.abs(vergences).max())
@@ -160,7 +160,7 @@ def _wavefront_error(wave: Wavefront) -> float:
     return float(np.sqrt(wave.light @ np.square(wave.path - terms @ plane))) / wave.wavelength
 
 
-def _vergence_of_least_spot(field: LensField, height: float) -> float | None:
+def _vergence_of_least_spot(field: Optics, height: float) -> float | None:
     """Return 1 / distance z of the smallest spot over z, whose square is a parabola in 1 / z; None without light."""
     here, beyond = (replace(field, distance=times * field.distance).wave(height, None) for times in (1, 2))
     if here is None or beyond is None:
@@ -174,7 +174,7 @@ def _distance(vergence: float | None) -> float | None:
     return 1 / vergence if vergence is not None and vergence > LEAST_VERGENCE else None
 
 
-def _distortion(camera: Camera, lens_type: LensType, rays: LensField) -> float:
+def _distortion(camera: Camera, lens_type: LensType, rays: Optics) -> float:
     """Return the relative change of the magnification at the rim, which gets light."""
     given, height = lens_type.optics.distortion, rays.field
     if given is not None:
@@ -183,5 +183,5 @@ def _distortion(camera: Camera, lens_type: LensType, rays: LensField) -> float:
         return tangent / float(distortion.undistort(tangent, 0.0, *given, scale, limit)[0]) - 1
     if lens_type.optics.surfaces is None:
         return 0.0
-    seen = float(np.hypot(*rays.centre(np.zeros(1), np.array([height])))[0])
+    seen = float(np.hypot(*rays.chief_ray(np.zeros(1), np.array([height])))[0])
     return height * rays.distance / (rays.depth * seen) - 1

@@ -19,11 +19,11 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.field import (
-    LensField,
+    Optics,
     bands,
     check_waves,
     exit_disk_of,
-    field_of,
+    optics_of,
     prescription_of,
     reach,
     sampling_tables,
@@ -72,7 +72,7 @@ class WaveLens(LensModel):
     has_weights = True
 
     def __init__(
-        self, camera: Camera, lens_type: LensType, rays: LensModel, fields: list[tuple[LensField, float]]
+        self, camera: Camera, lens_type: LensType, rays: LensModel, fields: list[tuple[Optics, float]]
     ) -> None:
         """Create the model of a lens type from that of its rays, its fields at the wavelengths, and their shares."""
         super().__init__(camera, lens_type)
@@ -136,7 +136,7 @@ class _Band:
     """The tables of a lens type at one wavelength, whose share of the light is `share`."""
 
     def __init__(
-        self, lens: LensModel, field: LensField, share: float, ends: list[float], cells: int, beyond: float
+        self, lens: LensModel, field: Optics, share: float, ends: list[float], cells: int, beyond: float
     ) -> None:
         """Tabulate the slopes between two vergences of the target, or at one if these are the same."""
         self._distorted = lens.distorted
@@ -144,7 +144,7 @@ class _Band:
         heights = np.linspace(0.0, field.field, HEIGHTS)
         # The ratio of heights on the target and on the sensor; that on the axis is the limit.
         near = np.maximum(heights, 1e-6 * field.field)
-        self._scale = _table(field.centre(near, np.zeros(HEIGHTS))[0] / near / field.distance)
+        self._scale = _table(field.chief_ray(near, np.zeros(HEIGHTS))[0] / near / field.distance)
         self._light = _table(field.lit_share(heights))
         waves = field.waves_of(ends[1] - ends[0])
         vergences = np.linspace(ends[0], ends[1], ceil(waves / STEP) + 1) if waves > SAME else np.array([sum(ends) / 2])
@@ -210,12 +210,12 @@ def _table(values: FloatArray) -> Any:
 def wide_lens(camera: Camera, lens_type: LensType) -> LensModel:
     """Return the model of a lens type with a width: of waves, unless light is rays or diffraction is negligible.
 
-    Raises InputError if surfaces form no image or pass no light, and as `field_of` and `check_waves` do.
+    Raises InputError if surfaces form no image or pass no light, and as `optics_of` and `check_waves` do.
     """
     rays = (ThinLens if lens_type.optics.surfaces is None else RealLens)(camera, lens_type)
     if not camera.wavelengths:
         return rays
-    fields = [(field_of(camera, lens_type, wavelength), share) for wavelength, share in bands(camera)]
+    fields = [(optics_of(camera, lens_type, wavelength), share) for wavelength, share in bands(camera)]
     for field, _ in fields:
         check_waves(lens_type, field)
     return rays if any(field.rays_suffice for field, _ in fields) else WaveLens(camera, lens_type, rays, fields)

@@ -20,9 +20,8 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from itertools import groupby
 from math import ceil, exp, inf
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -58,7 +57,7 @@ from .sampling.sample_law import LEAPS, SampleLaw
 from .world_view import rendered_world
 
 if TYPE_CHECKING:
-    from .renderer.renderer import Renderer
+    from .renderer.renderer import Points, Renderer
 
 DONE, AIM = 0.5, 0.25  # of the allowed variance: below which a pixel is done, and what a round is planned for
 LEAST = 256  # samples per pixel of a first round, at least
@@ -106,13 +105,7 @@ def render_until(
         if checkpoint is not None:
             checkpoint.offer(lambda: {**rounds.state(), "seconds": np.array(clock() - start)})
 
-    limit = inf if scene.render.time is None else scene.render.time
-    for indices in rounds.exact:
-        ended = len(rounds.sub_imagers) - len(rounds.unfinished)
-        for done in rounds.render_exact(indices):
-            progress((ended + done * len(indices) / 2) / len(rounds.sub_imagers))
-        save()
-    warned = False
+    limit, warned = inf if scene.render.time is None else scene.render.time, False
     while unfinished := rounds.unfinished:
         every = all(rounds.sub_imagers[index].rounds for index in unfinished)
         if limit == inf and not warned and every and rounds.rays > TIMED:
@@ -194,52 +187,6 @@ class AdaptiveRounds:
             most = max(most, sub.law.samples(max(factor, AIM), sub.last, MOST_SAMPLES))
         return most, float(most) * self.mean.size
 
-    @property
-    def exact(self) -> list[list[int]]:
-        """Indices of the sub-imagers that have yet to be shown without error; a list of those rendered together.
-
-        They are adjacent, of one lens type and one plan; on scalar each is alone.
-        """
-        waiting = [index for index, sub in enumerate(self.sub_imagers) if self._exact[index] and not sub.rounds]
-
-        def kind(numbered: tuple[int, int]) -> tuple[str, Plan | None, int]:
-            number, index = numbered
-            together = index - number if self._renderer.is_fast else index
-            return self._camera.sub_imagers[index].type.name, self._exact[index], together
-
-        return [[index for _, index in alike] for _, alike in groupby(enumerate(waiting), kind)]
-
-    def render_exact(self, indices: list[int]) -> Iterator[float]:
-        """Render adjacent sub-imagers of one lens type without error, and yield the finished share of them.
-
-        Averages are done, and of a grid pixels whose passes agree: their variance is float32's rounding. The others
-        take part in the rounds.
-        """
-        work, renderer, done = self.sub_imagers[indices[0]].next, self._renderer, 0
-        seeds = [sampler_seeds(self._scene.render.seed, "data", number, MOST_PASSES) for number in range(work.passes)]
-        pixels, averaged = renderer.sub_imagers(indices), work == AVERAGED
-        for block in renderer.blocks(pixels, 1 if averaged else work.total):
-            start = self._slices[indices[0]].start + done
-            part, done = slice(start, start + block.count), done + block.count
-            tally = Tally.of(renderer.expose(block, work.samples, seeds, "averages" if averaged else "grid")[0])
-            floor = rounding_variance(tally.mean, renderer.float32_samples(work.samples))
-            self.mean[part], self.variance[part] = tally.mean, np.maximum(tally.variance, floor)
-            self._open[part] = (tally.variance > floor) & (not averaged)
-            yield done / pixels.count
-        for index in indices:
-            self.sub_imagers[index] = self._after_exact(index, work)
-
-    def _after_exact(self, index: int, work: Plan) -> SubImagerProgress:
-        sub, still = replace(self.sub_imagers[index]), self._open[self._slices[index]]
-        sub.add_round(work, np.zeros(still.size))
-        sub.fewest = 0 if still.all() else sub.spent
-        if still.any():
-            sub.next = self._first(index)
-            sub.left = float(sub.next.total * still.sum())
-        else:
-            self._end(sub, index, FLOAT32)
-        return sub
-
     def render_round(self, index: int, seconds: float = inf, speed: float = inf) -> None:
         """Render the next round of a sub-imager and plan the one after it, or end it.
 
@@ -256,15 +203,37 @@ class AdaptiveRounds:
                 return
         seed, numbers = self._scene.render.seed, range(sub.seeds, sub.seeds + work.passes)
         seeds = [sampler_seeds(seed, "data", number, MOST_PASSES) for number in numbers]
-        chosen, points = self._renderer.sub_imagers([index], pixels), "sobol" if self._sobol[index] else "sampler"
+        chosen, points = self._renderer.sub_imagers([index], pixels), self._points(index, sub)
         tally = Tally.of(self._renderer.expose(chosen, work.samples, seeds, points)[0])
         floor = self._floor(index, tally.mean, work.samples)
         self.mean[start + pixels] = tally.mean
-        self.variance[start + pixels] = np.maximum(posterior_variances(tally.variance, work.passes), floor)
-        sub.add_round(work, tally.variance)
-        still = self._plan_next(sub, index, pixels)
+        if points in ("averages", "grid"):
+            self.variance[start + pixels] = np.maximum(tally.variance, floor)
+            sub.add_round(work, np.zeros(pixels.size))
+            still = self._plan_after_exact(sub, index, (tally.variance > floor) & (points == "grid"))
+        else:
+            self.variance[start + pixels] = np.maximum(posterior_variances(tally.variance, work.passes), floor)
+            sub.add_round(work, tally.variance)
+            still = self._plan_next(sub, index, pixels)
         # An interruption before this leaves a state from which the round is repeated.
         self._open[start + pixels], self.sub_imagers[index] = still, sub
+
+    def _points(self, index: int, sub: SubImagerProgress) -> Points:
+        """Return where the rays of the next round start."""
+        exact = None if sub.rounds else self._exact[index]
+        if exact is not None:
+            return "averages" if exact == AVERAGED else "grid"
+        return "sobol" if self._sobol[index] else "sampler"
+
+    def _plan_after_exact(self, sub: SubImagerProgress, index: int, still: BoolArray) -> BoolArray:
+        """Plan the first round with errors of pixels whose exact passes do not agree, or end the sub-imager."""
+        sub.fewest = 0 if still.all() else sub.spent
+        if still.any():
+            sub.next = self._first(index)
+            sub.left = float(sub.next.total * still.sum())
+        else:
+            self._end(sub, index, FLOAT32)
+        return still
 
     def _affordable(self, index: int, samples: float) -> Plan:
         """Return the next round's plan, or one of about `samples` per pixel if that is less."""

@@ -127,20 +127,13 @@ def _warn_of_cost(rounds: AdaptiveRounds, speed: float) -> bool:
     if rays / speed < LONG:
         return False
     sentence = (
-        f"render.samples = 'auto' takes about {duration(rays / speed)} more ({rays:.1e} rays), until the rendering's"
+        f"render.samples = 'auto' takes about {rays / speed / 60:.0f} min more ({rays:.1e} rays), until the rendering's"
         " variance is a tenth of the sensor's in every pixel"
     )
     if all_rays < WORTH * rays:
-        sentence += f"; on average it is with render.samples = {enough}, in {duration(all_rays / speed)}"
+        sentence += f"; on average it is with render.samples = {enough}, in {all_rays / speed / 60:.1g} min"
     logging.getLogger(__name__).warning("%s; render.time limits it", sentence)
     return True
-
-
-def duration(seconds: float) -> str:
-    """Return seconds, minutes or hours in words."""
-    if seconds >= 5400:
-        return f"{seconds / 3600:.1f} hours"
-    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
 class AdaptiveRounds:

@@ -7,7 +7,6 @@ rendered with the same integrator as the sub-images, with separate seeds, and wi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +21,11 @@ from ommatid.scenes.setup import Setup
 
 from .renderer.variant import choose
 from .renderer.world import describe
-from .sampling.passes import Plan, Tally, plan
-from .sampling.samplers import filling
+from .sampling.passes import Tally, plan
 from .world_view import ideal_camera, rendered_world
 
 FINER = 3  # depth is the median of 3 x 3 points of a pixel
 TRUER = 4  # times the samples of a sensor pixel, whose own noise changes the estimate by far more
-MOST_RAYS = 2**22  # that start together
 
 
 @dataclass(frozen=True)
@@ -51,9 +48,10 @@ def truth(setup: Setup) -> Truth:
     Raises InputError for a world that cannot be built, or a variant that does not work here.
     """
     scene, camera = setup.scene, setup.camera
-    variant, work = choose(scene.render.variant), _plan(setup)  # before Mitsuba is loaded
+    variant = choose(scene.render.variant)  # before Mitsuba is loaded
     from .renderer.renderer import Renderer
 
+    work = plan(TRUER * scene.render.sample_count, scene.render.sampler)
     renderer = Renderer(ideal_camera(camera).world, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     seeds = [sampler_seeds(scene.render.seed, "truth", number, work.passes + 1) for number in range(work.passes + 1)]
@@ -68,17 +66,6 @@ def truth(setup: Setup) -> Truth:
         depth=np.where(np.isfinite(depth), depth, np.nan),
         samples=work.total,
     )
-
-
-def _plan(setup: Setup) -> Plan:
-    """TRUER times the samples of a sensor pixel, in passes of a size that memory holds."""
-    render = setup.scene.render
-    work = plan(TRUER * render.sample_count, render.sampler)
-    most = max(1, MOST_RAYS // setup.camera.unknowns)
-    if work.samples <= most:
-        return work
-    samples = filling(render.sampler, most)
-    return Plan(ceil(work.total / samples), samples)
 
 
 def truth_from(setup: Setup) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache
 from math import ceil, isqrt, lcm
 from typing import Any
 
@@ -72,11 +71,8 @@ def on_grid(samples: int, sampler: Sampler, cells: int = 1, most: int = MOST_SAM
     fits = side**2 if sampler in JITTERED else fitting(sampler, each)
     if fits <= most:
         return Plan(FEWEST_PASSES, fits)
-    fits = (max(isqrt(most) // cells, 1) * cells) ** 2 if sampler in JITTERED else _filling(sampler, most)
+    fits = (max(isqrt(most) // cells, 1) * cells) ** 2 if sampler in JITTERED else filling(sampler, most)
     return Plan(max(FEWEST_PASSES, BATCHES * ceil(samples / fits / BATCHES)), fits)
-
-
-_filling = cache(filling)
 
 
 def cells_of(lens_type: LensType) -> int:

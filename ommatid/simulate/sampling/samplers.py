@@ -6,6 +6,7 @@ the recorded number is the one that was used.
 
 from __future__ import annotations
 
+from functools import cache
 from math import isqrt
 
 from ommatid.scenes.tables.estimation import Sampler
@@ -39,6 +40,7 @@ def fitting(sampler: Sampler, samples: int) -> int:
     return 4**exponent
 
 
+@cache
 def filling(sampler: Sampler, most: int) -> int:
     """Return the largest number of samples up to `most` that fills a sampler's grid, or the least one if none does."""
     return next(

@@ -20,7 +20,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy import special
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
@@ -29,7 +28,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.lens_type import LensType
 
-from ..calibration.fit.chart import freedom_of
+from ..calibration.fit.chart import Explanation
 from ..calibration.responses import Responses
 from ..ideal import designed_kernels
 from .deviations import Chart, chart_of
@@ -102,29 +101,27 @@ def refusal(camera: Camera, lens_type: LensType) -> str:
 class _Candidate:
     """A deviation of all rows, (C,), or None of the design.
 
-    chances : of each test;  excesses : of each test, the part of its sum of squares that is not noise, in units of the
-    noise
+    tests : of what it leaves, by name
     """
 
     deviation: FloatArray | None
-    chances: dict[str, float]
-    excesses: dict[str, float]
+    tests: dict[str, Explanation]
 
     @property
     def rejected(self) -> list[str]:
         """The tests that it does not pass."""
-        single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(self.chances))
-        return [name for name, value in self.chances.items() if value < single]
+        single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(self.tests))
+        return [name for name, test in self.tests.items() if test.chance < single]
 
     @property
     def unexplained(self) -> float:
         """Mean square of what it leaves of an entry beside noise, in units of the entry's variance."""
-        return self.excesses["all cells"]
+        return self.tests["all cells"].excess
 
     @property
     def shown(self) -> float:
         """The largest excess of the tests of a picture that it does not pass, in units of the noise."""
-        return max((self.excesses[name] for name in self.rejected if name.endswith("picture")), default=0.0)
+        return max((self.tests[name].excess for name in self.rejected if name.endswith("picture")), default=0.0)
 
 
 def _chosen(chart: Chart) -> _Candidate:
@@ -173,12 +170,11 @@ def _tested(chart: Chart, mean: FloatArray, learnt: bool) -> _Candidate:
         left.append(rest * root)
         for name, of in members.items():
             means[name].append(of @ rest / np.sqrt(np.maximum(of @ chart.inside, 1.0)))
-    tests = {"all cells": _gram(left)}
+    tests = {"all cells": _explanation(left)}
     for name, parts in means.items():
-        tests[name] = _gram([part * root for part in parts])
-        tests[f"{name} in a picture"] = _gram([chart.seen(part) for part in parts])
-    chances = {name: _chance(products) for name, products in tests.items()}
-    return _Candidate(mean[0] if learnt else None, chances, {name: _excess(each) for name, each in tests.items()})
+        tests[name] = _explanation([part * root for part in parts])
+        tests[f"{name} in a picture"] = _explanation([chart.seen(part) for part in parts])
+    return _Candidate(mean[0] if learnt else None, tests)
 
 
 def _members(index: IntArray) -> FloatArray:
@@ -186,29 +182,10 @@ def _members(index: IntArray) -> FloatArray:
     return (index == np.unique(index)[:, None]).astype(np.float64)
 
 
-def _gram(parts: list[FloatArray]) -> FloatArray:
-    """Return the products of the mean's and of the batches' residuals, summed: (1 + B, 1 + B)."""
-    flat = [part.ravel() for part in parts]
-    return np.array([[np.dot(a, b) for b in flat] for a in flat], dtype=np.float64)
-
-
-def _chance(products: FloatArray) -> float:
-    """Return the probability of a sum of squares at least as large as that of the mean if only noise is in it.
-
-    An F test with the effective degrees of freedom of the noise, as of `freedom_of`.
-    """
-    noise, free = products[1:, 1:], len(products) - 2
-    trace, freedom = float(np.trace(noise)) / free, freedom_of(noise)
-    if trace <= 0:
-        return 1.0
-    return float(special.fdtrc(freedom, freedom * free, float(products[0, 0]) / (trace / (free + 1))))
-
-
-def _excess(products: FloatArray) -> float:
-    """Return the part of a sum of squares that is not noise, in units of the noise."""
-    free = len(products) - 2
-    noise = float(np.trace(products[1:, 1:])) / (free * (free + 1))
-    return float(products[0, 0]) / noise - 1 if noise > 0 else 0.0
+def _explanation(residuals: list[FloatArray]) -> Explanation:
+    """Compare the residuals of the mean with those of the batches."""
+    flat = [part.ravel() for part in residuals]
+    return Explanation.of(np.array([[np.dot(a, b) for b in flat] for a in flat], dtype=np.float64))
 
 
 def _directions(chart: Chart, candidate: _Candidate) -> FloatArray:
@@ -237,7 +214,7 @@ def _details(chart: Chart, candidate: _Candidate) -> dict[str, Any]:
         "width": chart.places.width,
         "core": chart.core,
         "as_designed": candidate.deviation is None,
-        "chances": candidate.chances,
+        "chances": {name: test.chance for name, test in candidate.tests.items()},
         "unexplained": candidate.unexplained,
     }
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import sparse, special
 
 from ommatid.runtime.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from ommatid.scenes.camera import Camera
@@ -134,3 +134,33 @@ def freedom_of(gram: FloatArray) -> float:
     if trace == 0:
         return 1.0
     return max(1.0, trace**2 / max(squares, trace**2 * 1e-9))
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Weighted sum of squared residuals, its expectation from the batches, and the degrees of freedom of the sums."""
+
+    left: float
+    expected: float
+    freedom: float
+    batches: int
+
+    @property
+    def chance(self) -> float:
+        """Probability of a sum of squares at least as large if the model is correct; 0 where nothing was measured."""
+        if not self.expected:
+            return 0.0
+        return float(special.fdtrc(self.freedom, self.freedom * (self.batches - 1), self.left / self.expected))
+
+    @property
+    def excess(self) -> float:
+        """The part of the sum of squares that is not noise, in units of the noise."""
+        return self.left / self.expected - 1 if self.expected else 0.0
+
+    @staticmethod
+    def of(products: FloatArray) -> Explanation:
+        """Compare residuals by products of those of the mean and of the batches: (1 + B, 1 + B)."""
+        count, noise = len(products) - 1, products[1:, 1:]
+        return Explanation(
+            float(products[0, 0]), float(np.trace(noise)) / (count * (count - 1)), freedom_of(noise), count
+        )

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import special
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
@@ -25,7 +24,7 @@ from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import MeasuredRows
 
 from ..responses import Responses, Subsets
-from .chart import ChartRows, chart_of, chart_rows, freedom_of, side_for_kernels
+from .chart import ChartRows, Explanation, chart_of, chart_rows, freedom_of, side_for_kernels
 from .view_fit import SIGNIFICANCE, ViewFit, fit_views, predicted
 
 if TYPE_CHECKING:
@@ -36,23 +35,6 @@ STRAY = 0.5  # rays that each cell may miss or have in excess, by rounding of po
 Measure = Callable[[Subsets], Responses]
 Variances = Callable[[Responses], FloatArray]
 Rays = dict[str, int]
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """Weighted sum of squared residuals, its expectation from the batches, and the degrees of freedom of the sums."""
-
-    left: float
-    expected: float
-    freedom: float
-    batches: int
-
-    @property
-    def chance(self) -> float:
-        """Probability of a sum of squares at least as large if the model is correct; 0 where nothing was measured."""
-        if not self.expected:
-            return 0.0
-        return float(special.fdtrc(self.freedom, self.freedom * (self.batches - 1), self.left / self.expected))
 
 
 def explanation(chart: ChartRows, model: FloatArray, rays: int, recorded: bool = False) -> Explanation:

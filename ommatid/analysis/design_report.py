@@ -107,7 +107,11 @@ def _claim(best: BestCamera) -> tuple[str, str]:
 
 
 def _value(best: BestCamera, found: Evaluation) -> str:
-    return f"{-found.value:.4g} bits of information per pixel" if best.space.groups.goal == "information" else f"{found.value:.4g}"
+    return (
+        f"{-found.value:.4g} bits of information per pixel"
+        if best.space.groups.goal == "information"
+        else f"{found.value:.4g}"
+    )
 
 
 def _found(best: BestCamera, each: WholeMixture) -> str:

@@ -19,7 +19,7 @@ from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, views_as_designed
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints
-from ommatid.scenes.lens_type import LensType, SubImager
+from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.model import Model, designed_observation, fitted_model, is_stored
 from ommatid.scenes.optics.boxes import designed_box
 from ommatid.scenes.pose import pose_of, poses

@@ -10,11 +10,11 @@ from math import ceil, pi
 
 import numpy as np
 import pytest
+from ommatid.scenes.optics.diffraction import pattern
 from scipy import integrate
 from scipy.special import j0, j1
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.optics.diffraction import pattern
 from ommatid.scenes.optics.field import ThinField
 from ommatid.scenes.optics.point_spread import density, point_spread, relative_intensity, strehl_ratio
 from ommatid.scenes.optics.wavefront import GRID_REACH, Wavefront, node_counts, polar_nodes, thin_wavefront

@@ -86,7 +86,7 @@ class BatchEntry:
     @property
     def level(self) -> str:
         """The level of the verdict, empty where it is not known."""
-        return self.report.verdict.level if self.report and self.report.verdict else ""
+        return self.report.verdict.level if self.report else ""
 
     @property
     def root(self) -> float | None:

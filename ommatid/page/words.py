@@ -28,16 +28,15 @@ def sentence(report: RunReport) -> str:
 
 def reasons(report: RunReport) -> list[str]:
     """Return what speaks against the result, one sentence for each reason or doubt."""
-    return [_sentence(words) for words in report.verdict.reasons or report.verdict.doubts]
+    verdict = report.verdict
+    return [_sentence(words) for words in verdict.reasons or verdict.doubts]
 
 
 def grounds(report: RunReport) -> list[str]:
     """Return what the verdict rests on: passed checks of a result that can be trusted, notes, and assumptions."""
-    verdict, found = report.verdict, list[str]()
-    if is_trusted(report):
-        found += verdict.passed or (verdict_words.grounds(report),)
-    found += verdict.notes
-    return [_sentence(words) for words in (*found, *(f"assumed: {each}" for each in report.assumes))]
+    verdict = report.verdict
+    checked = (verdict.passed or (verdict_words.grounds(report),)) if verdict.trusted else ()
+    return [_sentence(words) for words in (*checked, *verdict.notes, *(f"assumed: {each}" for each in report.assumes))]
 
 
 def _sentence(words: str) -> str:

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from ommatid.reconstruct.output import run_json
-from ommatid.runtime.errors import InputError
 
 from ..conftest import Command
 from ..runs import document
@@ -40,13 +39,13 @@ def test_a_trusted_scene_passes_and_the_worst_exit_code_of_a_batch_counts(ommati
     assert "; not to be trusted: Tiny" in index
 
 
-def test_results_of_an_earlier_version_get_a_verdict(kept: Path, ommatid: Command) -> None:
+def test_results_without_a_verdict_get_one(kept: Path, ommatid: Command) -> None:
     path = kept / "run.json"
     before = json.loads(path.read_text(encoding="utf-8"))
     verdict = before.pop("verdict")
     path.write_text(json.dumps(before), encoding="utf-8")
-    with pytest.raises(InputError, match="verdict is wrong"):
-        run_json.read(kept)
+    refused = ommatid("report", kept)
+    assert (refused.code, "run.json: expected the results of a run" in refused.err) == (2, True)
     ended = ommatid("run", "tiny.toml", "-o", "out", "--strict")
     assert ended.code == 3
     assert json.loads(path.read_text(encoding="utf-8"))["verdict"] == verdict

@@ -20,7 +20,7 @@ VARYING = {
     r"[0-9a-f]{64}": "fingerprint",
     r"\d{4}-\d\d-\d\dT[\d:+]+": "date",
     r"<(td|dd)>[\d.e+-]+\s(s|ms|min|%)(?=\s|<)": "time",
-    r"(seconds</th>\s*<td>)[\d.e+-]+": "time",
+    r"(?<=[ (])[\d.e+-]+\ss(?=[,.)<])": "time",
     r"<code>ommatid run .*?</code>": "command",
 }
 OF_THE_MACHINE = ("versions", "fingerprint", "sha256", "seal")

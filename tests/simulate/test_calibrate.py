@@ -11,6 +11,7 @@ import pytest
 from scipy import sparse
 
 from ommatid.runtime.errors import InputError, MachineError
+from ommatid.runtime.progress import no_progress
 from ommatid.scenes import model_file
 from ommatid.scenes.camera import derive
 from ommatid.scenes.formats.picture import load
@@ -46,6 +47,16 @@ def test_no_two_sources_of_a_grid_reach_one_sensor_pixel() -> None:
             seen = (rows != 0).astype(np.float64) @ sources.ravel()
             assert seen.max() <= 1
         assert (lit == 1).all(), "every pixel of f is lit once"
+
+
+@pytest.mark.parametrize(("shape", "ratio"), [((1, 1), 1), ((1, 5), 1), ((2, 2), "1/2")])
+def test_cameras_of_a_pixel_are_fitted(shape: tuple[int, int], ratio: int | str, tmp_path: Path) -> None:
+    """Whose sub-images say nothing of where they look, and whose target is a single row: the H as designed."""
+    described = scene(
+        shape, ((ratio, [1, 1], [1, 1]),), render={"variant": "scalar_rgb"}, calibration={"samples": 64, "fit": "auto"}
+    )
+    found, _ = calibrate.cached_model(tmp_path / "model.npz", Setup.from_scene(described), no_progress)
+    np.testing.assert_allclose(found.observation.to_sparse().toarray(), ideal_matrix(found.camera).toarray())
 
 
 def test_a_source_assigned_to_the_wrong_pixel_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.camera import Camera
@@ -94,7 +94,13 @@ def film(width: int, height: int, channels: int = 1) -> dict[str, Any]:
 def black(camera: Camera, channels: int) -> dict[str, Any]:
     """Return a black picture on the target."""
     texels = np.zeros((camera.rows, camera.columns, channels), dtype=np.float32)
-    return texture_of({"bitmap": mi.Bitmap(texels)})
+    return texture_of({"bitmap": mi.Bitmap(twice_if_single(texels))})
+
+
+def twice_if_single(texels: Float32Array) -> Float32Array:
+    """Return texels whose single row or column stands twice, which changes no picture: textures have two at least."""
+    rows, columns = texels.shape[:2]
+    return texels.repeat(1 + (rows == 1), axis=0).repeat(1 + (columns == 1), axis=1)
 
 
 def texture_of(source: dict[str, Any]) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from ..sampling.samplers import fitting
 from .averages import Averages
 from .draws import SobolDraws
 from .loaded import dr, mi
-from .plugins import black, depths, scene_of, stock_sensors, target_of
+from .plugins import black, depths, scene_of, stock_sensors, target_of, twice_if_single
 from .rays import Pixels, RayGenerator, Rays, Seed
 from .variant import activate, check_fast_variant, ignored_samples
 from .worlds.placement import MILLIMETRES_AT_ORIGIN
@@ -123,7 +123,7 @@ class Renderer:
         texels = np.zeros((self.camera.rows, self.camera.columns, self.channels), dtype=np.float32)
         for channel, image in enumerate(images):
             texels[..., channel] = image * self._unit
-        self._parameters[self._texels] = mi.TensorXf(texels)
+        self._parameters[self._texels] = mi.TensorXf(twice_if_single(texels))
         self._parameters.update()
 
     def pixels(self, group: str, subset: IntArray | None = None) -> Pixels:

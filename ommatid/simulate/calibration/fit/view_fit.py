@@ -400,12 +400,14 @@ def _chance(solution: ViewSolution, numbers: tuple[int, ...], kind: str) -> floa
     for number in numbers:
         values, variance = solution.numbers[:, number], np.square(solution.own[:, number]).sum(axis=1)
         common = float(np.square(solution.shared[0, number]).sum())
-        if kind == "shared":
+        if kind != "shared" and not variance.any():
+            values, variance = values[:1], np.array([common])
+        known = variance > 0  # centroids of a single pixel may depend on no number
+        values, variance = values[known], variance[known]
+        if kind == "shared" and values.size:
             weights = 1 / variance
             values = values - float(weights @ values / weights.sum())
             freedom -= 1
-        elif not variance.any():
-            values, variance = values[:1], np.array([common])
         squares += float((np.square(values) / variance).sum())
         freedom += values.size
     return float(special.fdtrc(freedom, solution.freedom, squares / freedom)) if freedom else 1.0

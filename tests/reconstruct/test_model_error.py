@@ -223,3 +223,12 @@ def test_a_hidden_end_of_a_spectrum_follows_its_power_law() -> None:
     known = frequencies < 0.2
     np.testing.assert_allclose(continued(frequencies, np.where(known, spectrum, -1.0), known), spectrum, rtol=1e-9)
     assert not continued(frequencies, spectrum, np.zeros(9, dtype=np.bool_)).any()
+
+
+def test_a_target_of_one_pixel_has_no_waves() -> None:
+    described = scene((1, 1), ((1, [1, 1], [1, 1]),), noise={"variance": NOISE})
+    model = ideal_model(described, derive(described))
+    noise = np.full(1, NOISE)
+    method = _method(replace(model, stored=ideal_matrix(model.camera)), np.full(1, 100.0), noise)
+    contrast = true_contrast(method, _operators(method), noise, attenuated=False)
+    assert contrast.image == pytest.approx(method.image)

@@ -156,7 +156,8 @@ def _transfer(
     if attenuation is not None:
         first, second = attenuation.halves(image)
         power += waves.power(first, second) - waves.power(seen, first + second)
-    return np.clip(np.divide(power, whole, out=np.ones_like(whole), where=whole > FAINT * whole.max()), *TRANSFER)
+    seen_well = whole > FAINT * whole.max(initial=0.0)  # a target of one pixel has no waves
+    return np.clip(np.divide(power, whole, out=np.ones_like(whole), where=seen_well), *TRANSFER)
 
 
 def continued(frequencies: FloatArray, spectrum: FloatArray, determined: BoolArray) -> FloatArray:

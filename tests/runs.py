@@ -38,7 +38,6 @@ def report_of(**fields: Any) -> RunReport:
         "versions": {},
         "seeds": {"scene": 0, "data": 0, "calibration": None},
         "spent": {},
-        "verdict": {"trusted": True, "reasons": ()},
     }
     return RunReport.model_validate({**least, **fields})
 

@@ -79,11 +79,13 @@ def naming_source(source: Path, changes: Mapping[str, str] = MappingProxyType({}
     try:
         yield
     except InputError as error:
-        message = str(error).removeprefix(f"{source}: ")
+        whole = ValueError.__str__(error)  # as it was raised, before it is made printable
+        message = whole.removeprefix(f"{source}: ")
         wrong = [words for key, words in changes.items() if _names_key(message, key)]
-        if str(source) in message or (message != str(error) and not wrong):
+        if str(source) in message or (message != whole and not wrong):
             raise
-        raise InputError(f"{source}{' with ' if wrong else ''}{', '.join(wrong)}: {message}") from error
+        cause = error.__cause__ or error
+        raise InputError(f"{source}{' with ' if wrong else ''}{', '.join(wrong)}: {message}") from cause
 
 
 def _names_key(message: str, key: str) -> bool:

@@ -205,7 +205,7 @@ def test_the_mean_of_a_region() -> None:
 
 def test_a_region_from_the_command_line(kept: Path, ommatid: Command) -> None:
     files = (kept / "stack.exr", kept / "model.npz", "-o", "region.exr", "--region")
-    report = document(ommatid("reconstruct", *files, "2,3,4,5", "--json"))["region"]
+    report = document(ommatid("reconstruct", *files, "2,3,4,5", "--json"))["regions"][0]
     assert (report["corner"], report["size"]) == ([2, 3], [4, 5])
     assert report["deviation"] > 0
     both = ommatid("reconstruct", *files, "2,3,4,5", "--region", "0,0,2,2").out

@@ -140,7 +140,12 @@ def test_kernels_that_vary_over_the_field() -> None:
     task = task_of(with_apertures(wide(shape)))
     observation = observed(task.model.camera)
     parts = [
-        replace(part, degree=2, coefficients=UNEVEN, error_coefficients=np.zeros((0, 0, UNEVEN.size)))
+        replace(
+            part,
+            degree=2,
+            coefficients=part.coefficients[:, :1] * UNEVEN,
+            error_coefficients=np.zeros((0, 0, UNEVEN.size)),
+        )
         for part in observation.parts[:1]
         if isinstance(part, KernelFootprints)
     ]

@@ -121,9 +121,9 @@ def test_figures_do_not_depend_on_settings(tmp_path: Path) -> None:
     (tmp_path / "tiny.toml").write_text(TINY, encoding="utf-8")
     scene = read(tmp_path / "tiny.toml")
     changed: Any = {"axes.facecolor": "red", "font.size": 31, "lines.linewidth": 9, "svg.fonttype": "path"}
-    plain = svg_text(camera_drawing(scene, derive(scene)))
+    plain = svg_text(camera_drawing(scene, derive(scene)), "camera")
     with matplotlib.rc_context(changed):
-        assert svg_text(camera_drawing(scene, derive(scene))) == plain
+        assert svg_text(camera_drawing(scene, derive(scene)), "camera") == plain
         assert matplotlib.rcParams["font.size"] == 31
 
 

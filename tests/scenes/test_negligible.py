@@ -183,6 +183,7 @@ def test_a_pinhole_camera_imports_no_modules_of_lenses() -> None:
     )
     ended = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
     optics = (
+        "diffraction",
         "footprints",
         "distortion",
         "radiometry",
@@ -195,6 +196,7 @@ def test_a_pinhole_camera_imports_no_modules_of_lenses() -> None:
         "lens_kernels",
     )
     simulated = (
+        "renderer.diffracting_lens",
         "renderer.crosstalk",
         "renderer.real_lens",
         "renderer.world",

@@ -13,8 +13,10 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.pose import corner_offset, pose_of
 from ommatid.scenes.scene import parse
 from ommatid.simulate.renderer import lens as thin_lens
+from ommatid.simulate.renderer.variant import activate
 
 from ..examples import camera, mean_weights, needs, scene
+from .world_files import FAST
 
 PLACES = st.floats(-1, 1)
 
@@ -88,3 +90,16 @@ def test_rendered_light_follows_the_solid_angle() -> None:
     cosine = 1 / np.sqrt(1 + away[:, None] ** 2 + away[None, :] ** 2)
     assert cosine.min() < 0.6
     np.testing.assert_allclose(found, cosine**4, rtol=0.01)
+
+
+@pytest.mark.parametrize("ends", [(30.0, 40.0), (19.9, 25.0)])
+def test_patterns_of_many_waves_are_as_wide_as_the_disk_of_rays(ends: tuple[float, float]) -> None:
+    needs(FAST)
+    activate(FAST)
+    import mitsuba as mi
+
+    from ommatid.simulate.renderer.diffracting_lens import BandTable
+
+    waves, share = np.linspace(*ends, 5), 0.25
+    v, _ = BandTable(np.array(ends), 0.0, 64).at(mi.Float(waves), mi.Float(share), all_light=False)
+    assert np.array(v) == pytest.approx(4 * np.pi * waves * np.sqrt(share), rel=0.03)

@@ -17,7 +17,6 @@ from math import ceil, pi
 from typing import ClassVar
 
 import numpy as np
-from scipy import ndimage
 from scipy.interpolate import CubicSpline
 
 from ommatid.runtime.arrays import FloatArray
@@ -71,15 +70,6 @@ class Optics(ABC):
 
         half : of the width of the grid that the wave's nodes serve, where it is wider than that of its own
         """
-
-    @property
-    @abstractmethod
-    def cone(self) -> float:
-        """Projected solid angle, sr, on the axis, of what evenly spread rays go through."""
-
-    def lit_share(self, height: FloatArray) -> FloatArray:
-        """Return the mean weight, cos^4 or 0 where they are blocked, of rays that go evenly spread through the lens."""
-        return self.weight(height) / self.cone
 
     def rays(self, height: float, finest: float) -> Wavefront:
         """Return the rays of a sensor point that gets light, as many as resolve a period on the target."""
@@ -239,10 +229,9 @@ class SurfaceOptics(Optics):
         """Trace the wave through the surfaces; see `Optics.wave`."""
         return wavefront_of(self.prescription, self.disk, self.depth, height, self.distance, wavelength, half)
 
-    @property
-    def cone(self) -> float:
-        """Of the exit disk; see `Optics.cone`."""
-        return pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2
+    def lit_share(self, height: FloatArray) -> FloatArray:
+        """Return the mean weight of rays that leave evenly spread over the exit disk, as `trace` gives it."""
+        return self.weight(height) / (pi * (self.disk.radius / (self.depth + self.disk.height)) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,11 +245,6 @@ class ThinOptics(Optics):
     def wave(self, height: float, wavelength: float | None, half: float = 0.0) -> Wavefront | None:
         """Compute the wave, whose phase is quadratic; see `Optics.wave`."""
         return thin_wavefront(self.aperture, self.depth, height, self.distance, self.focus, wavelength, half)
-
-    @property
-    def cone(self) -> float:
-        """Of the aperture; see `Optics.cone`."""
-        return pi * (self.aperture / 2 / self.depth) ** 2
 
     def rays(self, height: float, finest: float) -> Wavefront:
         """Return the rays of a sensor point; see `Optics.rays`."""
@@ -279,7 +263,7 @@ class SamplingTables:
 
     heights : of the sensor point, (h,);  vergences : 1 / distance of the target, rising, (v,)
     densities : (h, v, n, n), rows along the direction of the sensor point;  width : of the slopes of all n points
-    captured : share of the light within that width;  spot : radius of the light's bright part, as a slope
+    captured : share of the light within that width
     """
 
     heights: FloatArray
@@ -287,13 +271,6 @@ class SamplingTables:
     densities: FloatArray
     width: float
     captured: float
-    spot: float
-
-    @property
-    def spread(self) -> FloatArray:
-        """The densities times (1 + (r / spot)^2)^1/2, so that faint light far away gets more of the rays."""
-        place = self.width * np.linspace(-0.5, 0.5, self.densities.shape[-1])
-        return self.densities * np.sqrt(1 + (place[:, None] ** 2 + place**2) / self.spot**2)
 
 
 def sampling_tables(field: Optics, vergences: FloatArray, cells: int, reach: float) -> SamplingTables:
@@ -306,7 +283,7 @@ def sampling_tables(field: Optics, vergences: FloatArray, cells: int, reach: flo
     heights, vergences = field.nodes[0], np.where(np.abs(vergences) < LEAST_VERGENCE, LEAST_VERGENCE, vergences)
     cases = [(replace(field, distance=1 / v), float(height), abs(v)) for height in heights for v in vergences]
     slopes = [(each.resolution * v, each.spot_radius * v) for each, v in ((at.outline(h), v) for at, h, v in cases)]
-    cell, bright = min(fine for fine, _ in slopes) / cells, max(spot + fine for fine, spot in slopes)
+    cell = min(fine for fine, _ in slopes) / cells
     half = max(spot + reach * fine for fine, spot in slopes)
     tables: list[FloatArray] = []
     captured: list[float] = []
@@ -315,13 +292,11 @@ def sampling_tables(field: Optics, vergences: FloatArray, cells: int, reach: flo
         values = spread.values if at.distance > 0 else spread.values[::-1, ::-1]
         damping = np.maximum(np.sinc(np.fft.fftfreq(len(values))) ** 2, np.sinc(1 / cells) ** 2)
         sharpened = np.fft.ifft2(np.fft.fft2(values) / np.outer(damping, damping)).real
-        kept = np.maximum(sharpened, 0.0)  # sharpened rings are negative where they are dark
-        mean, excess = (ndimage.uniform_filter(each, 2 * cells) for each in (sharpened, kept))
-        tables.append(kept * mean / excess / spread.inside)
+        tables.append(np.maximum(sharpened, 0.0) / spread.inside)
         captured.append(spread.inside)
     shape = (heights.size, vergences.size, *tables[0].shape)
     densities = np.stack(tables).reshape(shape).astype(np.float64)
-    return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)), bright)
+    return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)))
 
 
 def check_waves(lens_type: LensType, field: Optics) -> None:
@@ -358,10 +333,10 @@ def light_reach(camera: Camera, lens_type: LensType) -> float:
 def optics_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> Optics:
     """Return a lens type of the camera at a wavelength.
 
-    Raises InputError for a cone of light that no lens in air forms, and as `_surface_optics` does.
+    Raises InputError for a cone of light that no lens in air forms, and as `surface_optics` does.
     """
     if lens_type.optics.surfaces is not None:
-        return _surface_optics(camera, lens_type, wavelength)
+        return surface_optics(camera, lens_type, wavelength)
     depth, (far, _, _), aperture = camera.depth(lens_type), reach(camera, lens_type), lens_type.optics.aperture
     if aperture is None:
         aperture, wavelength = PINHOLE * depth, None
@@ -383,7 +358,7 @@ def optics_of(camera: Camera, lens_type: LensType, wavelength: float | None) -> 
     )
 
 
-def _surface_optics(camera: Camera, lens_type: LensType, wavelength: float | None) -> SurfaceOptics:
+def surface_optics(camera: Camera, lens_type: LensType, wavelength: float | None) -> SurfaceOptics:
     """Return a lens type of surfaces at a wavelength.
 
     The lens is scaled and placed as at the camera's wavelength; another one changes the glass alone, so that principal

@@ -1,7 +1,7 @@
 """Rays from the sensor through a pinhole or a thin lens into the world, on Mitsuba's fast backends.
 
-A lens type has one `LensModel`: a pinhole or a thin lens with its distortion, the surfaces of a real lens, or one of
-these whose light is waves (`real_lens`). Absent effects cost nothing.
+A lens type has one `LensModel`, composed of its properties: a pinhole, a thin lens with its distortion, one that
+diffracts (`diffracting_lens`), or the surfaces of a real one (`real_lens`). Absent effects cost nothing.
 
 Lengths are millimetres from the centre of the lens: the sensor at z = -depth, the target at z > 0. The image on the
 sensor is upside down, sub-images are upright: pixel (0, 0) of a sub-image looks at the top left of its window and has
@@ -78,15 +78,12 @@ class LensModel:
 
     def chief(self, x: Any, y: Any, depth: Any) -> tuple[Any, Any]:
         """Return the slopes, behind the lens, of the ray through its centre."""
-        return self.distorted(*through_centre(x, y, depth))
-
-    def distorted(self, across: Any, up: Any) -> tuple[Any, Any]:
-        """Return the slopes that a ray has behind the lens with its distortion, from those without."""
+        slopes = through_centre(x, y, depth)
         if self._distortion is None:
-            return across, up
+            return slopes
         from ommatid.scenes.optics.distortion import undistort
 
-        return undistort(across, up, *self._distortion, self._corner, self._limit)
+        return undistort(*slopes, *self._distortion, self._corner, self._limit)
 
 
 class ThinLens(LensModel):
@@ -94,10 +91,10 @@ class ThinLens(LensModel):
 
     has_weights = True
 
-    def __init__(self, camera: Camera, lens_type: LensType) -> None:
-        """Create the model of a lens type with an aperture."""
+    def __init__(self, camera: Camera, lens_type: LensType, aperture: float) -> None:
+        """Create the model of a lens type with an aperture of this diameter."""
         super().__init__(camera, lens_type)
-        self._radius = dr.opaque(mi.Float, (lens_type.optics.aperture or 0.0) / 2)
+        self._radius = dr.opaque(mi.Float, aperture / 2)
         self._focal = dr.opaque(mi.Float, camera.focal_length(lens_type))
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:

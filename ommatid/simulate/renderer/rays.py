@@ -25,7 +25,7 @@ from ommatid.scenes.tables.estimation import Sampler
 from ..sampling.passes import Plan
 from ..sampling.samplers import RELATED_DRAWS, fitting
 from .draws import GridDraws, ReseededSampler
-from .lens import Distance, LensModel
+from .lens import Distance, LensModel, ThinLens
 from .loaded import dr, mi
 from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
 
@@ -184,9 +184,19 @@ class RayGenerator:
 
 
 def lens_of(camera: Camera, lens_type: LensType) -> LensModel:
-    """Create the lens model of a lens type. Raises as `wide_lens` does."""
-    if not lens_type.optics.has_width:
-        return LensModel(camera, lens_type)
-    from .real_lens import wide_lens
+    """Create the lens model of a lens type."""
+    if lens_type.optics.surfaces is not None:
+        from .real_lens import real_lens
 
-    return wide_lens(camera, lens_type)
+        return real_lens(camera, lens_type)
+    aperture = lens_type.optics.aperture
+    if aperture is None:
+        return LensModel(camera, lens_type)
+    if camera.wavelengths:
+        from ommatid.scenes.optics.field import optics_of
+
+        if not all(optics_of(camera, lens_type, wavelength).rays_suffice for wavelength, _ in camera.wavelengths):
+            from .diffracting_lens import DiffractingLens
+
+            return DiffractingLens(camera, lens_type, aperture)
+    return ThinLens(camera, lens_type, aperture)

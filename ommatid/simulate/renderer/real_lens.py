@@ -1,15 +1,13 @@
-"""Rays from the sensor through a lens with a width into the world, on Mitsuba's fast backends.
+"""Rays from the sensor through the surfaces of a real lens into the world, on Mitsuba's fast backends.
 
-Light that is rays is traced through the surfaces of a real lens. Light that is waves leaves any lens in directions
-drawn from the point-spread function of the sensor point at the distance of what it meets. Before a flat target this is
-the target's. In a world the ray of geometrical optics through a point of the pupil finds the distance. (Where a surface
-ends before another, the pattern on either is not exact.)
+Light that is waves leaves in directions drawn from the point-spread function of the sensor point at the distance of
+what it meets. Before a flat target this is the target's. In a world the ray of geometrical optics through a point of
+the pupil finds the distance. (Where a surface ends before another, the pattern on either is not exact.)
 """
 
 # pyright: basic
 from __future__ import annotations
 
-from functools import cached_property
 from math import ceil, pi
 from typing import Any
 
@@ -19,25 +17,25 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.field import (
-    Optics,
+    SurfaceOptics,
     bands,
     check_waves,
     exit_disk_of,
-    optics_of,
     prescription_of,
     reach,
     sampling_tables,
+    surface_optics,
 )
 from ommatid.scenes.optics.ray_trace import Functions, path, trace
 from ommatid.scenes.optics.wavefront import GRID_REACH
 
-from .lens import Distance, Emission, LensModel, Point, ThinLens
+from .lens import Distance, Emission, LensModel, Point
 from .loaded import dr, mi
 
 HEIGHTS = 257  # off the axis, between which the middle and the amount of the light are interpolated linearly
 CELLS, FEW = 8, 4  # of the grid that slopes are drawn from, per wavelength times f-number; where defocus varies
 FEW_REACH = 20.0  # of that grid where defocus varies
-WAVES = 4.0  # of defocus, beyond which light is rays in a world
+WAVES = 3.0  # of defocus, beyond which light is rays in a world
 NEAR = 20.0  # pupil radii: surfaces that are nearer get light as rays
 STEP = 0.125  # waves between tabulated defoci, between which the light of the two is mixed
 SAME = 1e-3  # waves by which defocus may vary without a table of several
@@ -66,18 +64,13 @@ class RealLens(LensModel):
         return (at_x, at_y, 0), direction, weight
 
 
-class WaveLens(LensModel):
-    """A lens whose light is waves of one or several wavelengths."""
+class WaveLens(RealLens):
+    """A lens of surfaces, whose light is waves of one or several wavelengths."""
 
-    has_weights = True
-
-    def __init__(
-        self, camera: Camera, lens_type: LensType, rays: LensModel, fields: list[tuple[Optics, float]]
-    ) -> None:
-        """Create the model of a lens type from that of its rays, its fields at the wavelengths, and their shares."""
+    def __init__(self, camera: Camera, lens_type: LensType, fields: list[tuple[SurfaceOptics, float]]) -> None:
+        """Create the model of a lens type with its fields at the wavelengths of the light, and their shares."""
         super().__init__(camera, lens_type)
-        self._rays, self._fields = rays, fields
-        self._depth, self._vergence = camera.depth(lens_type), 1 / camera.distance_of(lens_type)
+        self._fields, self._depth, self._vergence = fields, camera.depth(lens_type), 1 / camera.distance_of(lens_type)
         self._focus = 1 / camera.focus(lens_type)
         self._distance: Distance | None = None
         _, least, largest = reach(camera, lens_type)
@@ -96,23 +89,25 @@ class WaveLens(LensModel):
         self.captured = 1.0  # rays go where the rest of the light lands, too
 
     def _tabulate(self, ends: list[float], cells: int, beyond: float) -> None:
-        self._bands = [_Band(self, field, share, ends, cells, beyond) for field, share in self._fields]
+        self._bands = [_Band(field, share, ends, cells, beyond) for field, share in self._fields]
         shares = [share for _, share in self._fields]
         self.captured = float(np.average([band.captured for band in self._bands], weights=shares))
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
-        sample, nearer = sampler.next_2d(), self._depth / depth
-        drawn, vergence, ray = 0.0 if len(self._bands) == 1 else sampler.next_1d(), self._vergence, None
+        sample = sampler.next_2d()
+        band = self._bands[0] if len(self._bands) == 1 else None
+        drawn, vergence, ray = 0.0 if band else sampler.next_1d(), self._vergence, None
         if self._distance is not None:
-            ray = self._rays.emit(x, y, depth, sampler, lens)
+            ray = super().emit(x, y, depth, sampler, lens)
             vergence = self._met(self._distance, ray, x, y, depth, lens)
         vergence += 1 / depth - 1 / self._depth
-        found = [band.emit(x, y, nearer, vergence, sample, ray is not None, self.spreads) for band in self._bands]
-        (across, up, weight), begin = found[0], self._bands[0].share
-        for band, values in zip(self._bands[1:], found[1:], strict=True):
-            after = drawn >= begin
-            across, up, weight = (dr.select(after, *pair) for pair in zip(values, (across, up, weight), strict=True))
+        across, up, weight = self._bands[0].emit(x, y, self._depth / depth, vergence, sample, ray is not None)
+        begin = self._bands[0].share
+        for band in self._bands[1:]:
+            after, found = drawn >= begin, band.emit(x, y, self._depth / depth, vergence, sample, ray is not None)
+            values = zip(found, (across, up, weight), strict=True)
+            across, up, weight = (dr.select(after, new, old) for new, old in values)
             begin += band.share
         if ray is None:
             return (0, 0, 0), (across, up, 1), weight
@@ -135,11 +130,8 @@ class WaveLens(LensModel):
 class _Band:
     """The tables of a lens type at one wavelength, whose share of the light is `share`."""
 
-    def __init__(
-        self, lens: LensModel, field: Optics, share: float, ends: list[float], cells: int, beyond: float
-    ) -> None:
+    def __init__(self, field: SurfaceOptics, share: float, ends: list[float], cells: int, beyond: float) -> None:
         """Tabulate the slopes between two vergences of the target, or at one if these are the same."""
-        self._distorted = lens.distorted
         self.share, self.ends, self._last = share, ends, field.field
         heights = np.linspace(0.0, field.field, HEIGHTS)
         # The ratio of heights on the target and on the sensor; that on the axis is the limit.
@@ -148,42 +140,28 @@ class _Band:
         self._light = _table(field.lit_share(heights))
         waves = field.waves_of(ends[1] - ends[0])
         vergences = np.linspace(ends[0], ends[1], ceil(waves / STEP) + 1) if waves > SAME else np.array([sum(ends) / 2])
-        self._tables = tables = sampling_tables(field, vergences, cells, beyond)
+        tables = sampling_tables(field, vergences, cells, beyond)
         self.captured, self._width, self._varies = tables.captured, tables.width, vergences.size > 1
-
-    @cached_property
-    def _even(self) -> Any:
-        return self._slopes(self._tables.densities)
-
-    @cached_property
-    def _spread(self) -> Any:
-        return self._slopes(self._tables.spread)
-
-    def _slopes(self, densities: FloatArray) -> Any:
-        heights, values = self._tables.heights.tolist(), densities.astype(np.float32)
-        if self._varies:
-            return mi.MarginalContinuous2D2(values, [heights, self._tables.vergences.tolist()])
-        return mi.MarginalContinuous2D1(values[:, 0], [heights])
+        densities = tables.densities.astype(np.float32)
+        nodes = [field.nodes[0].tolist()]
+        self._slopes: Any = (
+            mi.MarginalContinuous2D2(densities, [*nodes, vergences.tolist()])
+            if self._varies
+            else mi.MarginalContinuous2D1(densities[:, 0], nodes)
+        )
 
     def chief(self, x: Any, y: Any, nearer: Any) -> tuple[Any, Any]:
         """Return the mean slopes of the light of a sensor point whose depth is the designed one over `nearer`."""
         scale = self._interpolated(self._scale, dr.sqrt(x * x + y * y)) * nearer
-        return self._distorted(x * scale, y * scale)
+        return x * scale, y * scale
 
-    def emit(
-        self, x: Any, y: Any, nearer: Any, vergence: Any, sample: Any, all_light: bool, spreads: bool
-    ) -> tuple[Any, Any, Any]:
-        """Return the slopes of a ray and its weight.
-
-        all_light : False for the light within the table alone;  spreads : as of `LensModel`
-        """
+    def emit(self, x: Any, y: Any, nearer: Any, vergence: Any, sample: Any, all_light: bool) -> tuple[Any, Any, Any]:
+        """Return the slopes of a ray and its weight; `all_light` is False for the light within the table alone."""
         height, (across, up) = dr.sqrt(x * x + y * y), self.chief(x, y, nearer)
         at = [dr.minimum(height, self._last)]
         share = self.captured if all_light else 1.0
         within = type(sample)(dr.minimum(sample.x / share, 1.0), sample.y)
-        drawn, _ = (self._spread if spreads else self._even).sample(
-            within, [*at, dr.clip(vergence, *self.ends)] if self._varies else at
-        )
+        drawn, _ = self._slopes.sample(within, [*at, dr.clip(vergence, *self.ends)] if self._varies else at)
         beside, along = (drawn.x - 0.5) * self._width, (drawn.y - 0.5) * self._width
         if all_light:  # the light beyond radius r falls as 1 / r
             beyond, (turn, other) = sample.x > share, dr.sincos(2 * pi * sample.y)
@@ -192,8 +170,6 @@ class _Band:
         cosine = dr.select(height > 0, y / height, 1.0)
         sine = dr.select(height > 0, x / height, 0.0)
         weight = self._interpolated(self._light, height)
-        if spreads:
-            weight *= dr.rsqrt(1 + (beside * beside + along * along) / self._tables.spot**2)
         return across + along * sine + beside * cosine, up + along * cosine - beside * sine, weight
 
     def _interpolated(self, table: Any, height: Any) -> Any:
@@ -207,15 +183,14 @@ def _table(values: FloatArray) -> Any:
     return mi.Float(values.astype(np.float32))
 
 
-def wide_lens(camera: Camera, lens_type: LensType) -> LensModel:
-    """Return the model of a lens type with a width: of waves, unless light is rays or diffraction is negligible.
+def real_lens(camera: Camera, lens_type: LensType) -> LensModel:
+    """Return the model of a lens type with surfaces: of waves, unless light is rays or diffraction is negligible.
 
-    Raises InputError if surfaces form no image or pass no light, and as `optics_of` and `check_waves` do.
+    Raises InputError if the surfaces form no image or pass no light.
     """
-    rays = (ThinLens if lens_type.optics.surfaces is None else RealLens)(camera, lens_type)
-    if not camera.wavelengths:
-        return rays
-    fields = [(optics_of(camera, lens_type, wavelength), share) for wavelength, share in bands(camera)]
+    fields = [(surface_optics(camera, lens_type, wavelength), share) for wavelength, share in bands(camera)]
     for field, _ in fields:
         check_waves(lens_type, field)
-    return rays if any(field.rays_suffice for field, _ in fields) else WaveLens(camera, lens_type, rays, fields)
+    if any(field.rays_suffice for field, _ in fields):
+        return RealLens(camera, lens_type)
+    return WaveLens(camera, lens_type, fields)

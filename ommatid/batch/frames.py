@@ -221,7 +221,7 @@ def _made(
     workers: Workers | None = None,
     progress: Progress = no_progress,
 ) -> tuple[RunReport, bool]:
-    """Reconstruct a frame and write its files, the EXR file last: where it is, both are there."""
+    """Reconstruct a frame and write its files, the EXR file first: a disk that is full for it gets none."""
     stack = options.applied(stack_file.read(frame.stack), frame.stack)
     truth = result_files.truth_beside(frame.stack, stack)
     names = frame.stack, options.model
@@ -229,8 +229,8 @@ def _made(
     report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
     clear_formats(frame.output)
     frame.output.unlink(missing_ok=True)
-    result_files.write_picture(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
     result_files.write_estimate(frame.output, outcome, result_files.record_of(report))
+    result_files.write_picture(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
     write_formats(frame.output, options.formats)
     return report, True
 

@@ -44,7 +44,7 @@ def predicted_sections(members: Sequence[Member], outcome: BatchOutcome, detail:
     Scenes that failed are left out.
     """
     pairs = [pair for pair in zip(members, outcome.documents, strict=True) if "error" not in pair[1]]
-    if detail == "table" or len(members) == 1:
+    if detail == "table" or (len(members) == 1 and detail != "verdict"):
         each = [section for member, document in pairs for section in _prediction_sections(member.content, document)]
         return [*each, *outcome.sections]
     if detail == "verdict" or outcome.sections or not pairs:

@@ -201,6 +201,7 @@ def test_several_scenes_are_compared_and_swept_by_dots_and_for_every_lens_type(
     assert [line.partition(":")[0] for line in ommatid(*sweep).out.splitlines()] == [
         f"tile19, noise.bits = {bits}" for bits in (8, 9, 10)
     ]
+    assert len(ommatid("predict", "tile19", "--no-rays", "-q").out.splitlines()) == 1
     small = ("predict", "tile19", "--no-rays", "--set", "camera.lens.*.pixels=[2,2]", "--json")
     assert document(ommatid(*small))[0]["measurements"] == 50 * 4
     monkeypatch.setenv("FORCE_COLOR", "1")  # as a terminal

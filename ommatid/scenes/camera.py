@@ -390,7 +390,7 @@ def _lens_type(lens: LensTable, rows: int, columns: int, scene: Scene) -> LensTy
     if pixels[0] > most[0] or pixels[1] > most[1]:
         raise InputError(
             f"{scene.source}: camera.lens.{lens.name}.pixels asks for {pixels[0]} x {pixels[1]} pixels,"
-            f" but a {rows} x {columns}-pixel target holds at most {most[0]} x {most[1]}"
+            f" but a {rows} x {columns}-pixel target holds at most {most[0]} x {most[1]}; use 'fit'"
         )
     surfaces = None if isinstance(lens.surfaces, str) else lens.surfaces  # reading the scene replaced file names
     blur = scene.camera.pixel_blur

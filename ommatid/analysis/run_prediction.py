@@ -14,8 +14,8 @@ import numpy as np
 
 from ommatid.reconstruct.assumptions import Assumptions, assumptions_at, assumptions_for, with_fallback
 from ommatid.reconstruct.coarse_model import model_of_f
-from ommatid.reconstruct.frame.bands import leaves_null_space
 from ommatid.reconstruct.frame.frame_method import FrameMethod
+from ommatid.reconstruct.frame.readings import leaves_null_space
 from ommatid.reconstruct.frame.windows import varies_over_field
 from ommatid.reconstruct.method_choice import METHODS, MethodChoice
 from ommatid.reconstruct.methods.dense_method import DenseMethod

@@ -12,10 +12,10 @@ from ommatid.scenes.constants import MOST_DENSE
 from ommatid.scenes.scene import Scene
 
 from .estimator.estimate import needed_memory
-from .frame.bands import leaves_null_space
 from .frame.conjugate_gradients import band_width, band_work, serves
 from .frame.frame_method import FrameMethod
 from .frame.reading_space import MOST_READINGS, MOST_UNKNOWNS
+from .frame.readings import leaves_null_space
 from .frame.variance_map import LONG
 from .frame.windows import CORE, LONG_HALO
 from .methods.dense_method import DenseMethod

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ommatid.reconstruct.frame.bands import leaves_null_space
+from ommatid.reconstruct.frame.readings import leaves_null_space
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray

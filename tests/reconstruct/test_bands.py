@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy import fft, sparse
 
 from ommatid.reconstruct.frame import windows
-from ommatid.reconstruct.frame.bands import Bands, Readings
+from ommatid.reconstruct.frame.bands import Bands
+from ommatid.reconstruct.frame.readings import Readings
 from ommatid.reconstruct.frame.variance_map import VarianceMap, moments
 from ommatid.reconstruct.prior import exponential_spectrum, reflecting_root
 from ommatid.scenes.observation import Observation, repetition

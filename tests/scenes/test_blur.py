@@ -183,20 +183,20 @@ def by_fourier(y: float, x: float, ratio: float, blur: Blur, count: int = 100) -
     return float(4 * radial @ (axis(down, y) * axis(across, x)) @ (np.pi / 4 * weights))
 
 
-def compare(ratio: float, shift: float, row: Numbers, second: Callable[[float, float], float]) -> None:
-    """Entries of some pixels of f against a second method of their corner's (y, x) from the footprint's."""
-    width = len(row)
+def worst(ratio: float, row: Numbers, second: Callable[[float, float], float]) -> float:
+    """Largest difference of entries from a second method of their corner (y, x), over the largest entry."""
+    width, found = len(row), list[float]()
     for down, across in ((0, 0), (0, 1), (1, 1), (2, 0), (2, 3)):
         y, x = (width // 2 + step - (width - ratio) / 2 for step in (down, across))
-        entry = row[width // 2 + down, width // 2 + across]
-        assert entry == pytest.approx(second(y, x), abs=shift * row.max()), (down, across)
+        found.append(abs(row[width // 2 + down, width // 2 + across] - second(y, x)))
+    return float(np.max(found) / row.max())
 
 
 @pytest.mark.parametrize("disk", [1e-2, 0.7, 2.0, 7.3, 25.0])
 @pytest.mark.parametrize("ratio", [3.0, 2.5, 1e6 / 333333])
 def test_disk_against_an_integral_along_lines(ratio: float, disk: float) -> None:
     row = Blur(disk).row((ratio, ratio), 41)
-    compare(ratio, 1e-3, row, lambda y, x: along_lines(y, x, ratio, disk))
+    assert worst(ratio, row, lambda y, x: along_lines(y, x, ratio, disk)) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_disk_against_an_integral_along_lines(ratio: float, disk: float) -> None
 @pytest.mark.parametrize("ratio", [3.0, 2.5])
 def test_airy_against_fourier(ratio: float, blur: Blur) -> None:
     """So near to a footprint the light that lands beyond the grid contributes nothing."""
-    compare(ratio, 1e-6, blur.row((ratio, ratio), 21), lambda y, x: by_fourier(y, x, ratio, blur))
+    assert worst(ratio, blur.row((ratio, ratio), 21), lambda y, x: by_fourier(y, x, ratio, blur)) < 1e-6
 
 
 @pytest.mark.parametrize("blur", [Blur(1.3), Blur(0.7, 0.3), Blur(airy=0.3), Blur(2.0, 0.3, 0.05)])

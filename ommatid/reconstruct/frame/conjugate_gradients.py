@@ -34,7 +34,8 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.observation import Observation
 
 from ..methods.method import EstimationTask
-from .bands import Bands, bands_of, leaves_null_space
+from .bands import Bands, bands_of
+from .readings import leaves_null_space
 
 Indices = NDArray[np.intp]
 

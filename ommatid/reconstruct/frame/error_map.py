@@ -23,9 +23,9 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.observation import Entries
 
 from ..methods.method import EstimationTask
-from .bands import leaves_null_space
 from .conjugate_gradients import BandedFactor, FrameSystem, NotReachedError
 from .reading_space import ReadingSpace
+from .readings import leaves_null_space
 from .swept import swept_maps
 from .variance_map import EVEN_EDGES, VarianceMap, Way, frame_map, is_narrow, mean_ratios, ways_to_edges
 from .windows import HALOS, Windows, by_windows, has_few_windows, of_mean_kernels, varies_over_field, windows_map

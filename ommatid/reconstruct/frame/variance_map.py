@@ -24,7 +24,8 @@ from ..forms.cholesky import factorise_positive
 from ..methods.method import EstimationTask
 from ..prior import averaged_spectrum, cosine_waves
 from ..problem import dense_or_sparse, gram
-from .bands import Bands, leaves_null_space
+from .bands import Bands
+from .readings import leaves_null_space
 from .swept import swept_maps
 
 SIDE, FINE_SIDE, QUICK_SIDE = 40, 18, 24  # pixels of f of a small frame, where the world is finer, and for a mean

@@ -303,6 +303,17 @@ def from_recorded_points(
     _check_seen(camera, entries, seen, starts)
     _check_order(camera, entries, seen)
     matrix = sparse.csr_array((entries.mean, entries.unknown, starts), shape=(camera.measurements, camera.unknowns))
+    record = _record(camera, frames, settings, value, positions) | {"seconds": perf_counter() - start}
+    once = scene.sensor is None and not (entries.count > 1).any()
+    batches = np.sqrt(shared)[None].astype(np.float32)
+    model = Model(setup.resolved, camera, matrix, variance, batches, record)
+    return RecordedCalibration(model, frames, unlit.stray, once)
+
+
+def _record(
+    camera: Camera, frames: RecordedFrames, settings: AcquisitionSettings, value: float, positions: Sequence[IntArray]
+) -> dict[str, Any]:
+    """Return how the model was made: from which files, and by what."""
     made_from = {
         "camera": camera.describe(),
         "source": frames.sources,
@@ -310,18 +321,13 @@ def from_recorded_points(
         "value": value,
         "places": [of_exposure.tolist() for of_exposure in positions],
     }
-    record = {
+    return {
         "fingerprint": fingerprint(made_from),
         "method": RECORDED,
         "source": frames.sources,
         "exposures": len(frames.numbers),
-        "seconds": perf_counter() - start,
         "versions": versions("scipy", "scikit-image", "OpenEXR"),
     }
-    once = scene.sensor is None and not (entries.count > 1).any()
-    batches = np.sqrt(shared)[None].astype(np.float32)
-    model = Model(setup.resolved, camera, matrix, variance, batches, record)
-    return RecordedCalibration(model, frames, unlit.stray, once)
 
 
 def _check_pixels_of_f(setup: Setup) -> None:

@@ -221,16 +221,17 @@ def _made(
     workers: Workers | None = None,
     progress: Progress = no_progress,
 ) -> tuple[RunReport, bool]:
-    """Reconstruct a frame and write its files, the EXR file first: a disk that is full for it gets none."""
+    """Reconstruct a frame and write its files, the EXR file first: a disk that is full for it keeps the old ones."""
     stack = options.applied(stack_file.read(frame.stack), frame.stack)
     truth = result_files.truth_beside(frame.stack, stack)
     names = frame.stack, options.model
     outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, workers, progress, prepared)
     report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
-    clear_formats(frame.output)
-    frame.output.unlink(missing_ok=True)
+    picture = frame.output.with_suffix(".png")
     result_files.write_estimate(frame.output, outcome, result_files.record_of(report))
-    result_files.write_picture(frame.output.with_suffix(".png"), outcome.estimate.reshape(outcome.shape))
+    picture.unlink(missing_ok=True)
+    clear_formats(frame.output)
+    result_files.write_picture(picture, outcome.estimate.reshape(outcome.shape))
     write_formats(frame.output, options.formats)
     return report, True
 

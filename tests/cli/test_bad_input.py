@@ -351,6 +351,16 @@ def test_a_full_disk_leaves_no_file(arguments: tuple[str, ...], file: str, room:
     assert contents(here) == before
 
 
+@pytest.mark.slow
+def test_a_full_disk_leaves_the_old_estimate(here: Path, kept: Path, ommatid: Command) -> None:
+    assert kept.is_dir()
+    assert ommatid(*RECONSTRUCT).code == 0
+    before = contents(here)
+    ended = shell(*RECONSTRUCT, "--set", "prior.variance=100", cwd=here, before=full_after(1000))
+    assert_refused(ended, "new.exr", "could not be written", code=1)
+    assert contents(here) == before
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_output_that_cannot_be_printed_is_an_error(here: Path) -> None:
     before = "import os; os.dup2(os.open('/dev/full', os.O_WRONLY), 1)"

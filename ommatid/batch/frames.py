@@ -18,7 +18,7 @@ import numpy as np
 
 from ommatid.reconstruct.methods.method import Prepared
 from ommatid.reconstruct.output import result_files
-from ommatid.reconstruct.output.estimate_formats import Format, check_formats, clear_formats, write_formats
+from ommatid.reconstruct.output.estimate_formats import Format, check_formats, files_in_formats, write_formats
 from ommatid.reconstruct.output.result_files import Region, region_reports
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import check_camera, check_region
@@ -228,9 +228,10 @@ def _made(
     outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, workers, progress, prepared)
     report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
     picture = frame.output.with_suffix(".png")
+    earlier = [picture, *files_in_formats(frame.output)]
     result_files.write_estimate(frame.output, outcome, result_files.record_of(report))
-    picture.unlink(missing_ok=True)
-    clear_formats(frame.output)
+    for path in earlier:
+        path.unlink(missing_ok=True)
     result_files.write_picture(picture, outcome.estimate.reshape(outcome.shape))
     write_formats(frame.output, options.formats)
     return report, True

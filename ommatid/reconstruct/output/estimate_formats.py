@@ -53,12 +53,9 @@ def format_file(estimate: Path, name: Format) -> Path:
     return estimate.with_suffix(".npy" if name == "npy" else ".tiff")
 
 
-def clear_formats(estimate: Path) -> None:
-    """Remove the files that show the estimate in an OpenEXR file, before that is replaced. Other files stay."""
-    for name in ("npy", "tiff16"):
-        path = format_file(estimate, name)
-        if shows_estimate(path, estimate):
-            path.unlink()
+def files_in_formats(estimate: Path) -> list[Path]:
+    """Return the files that show the estimate in an OpenEXR file, which another estimate makes wrong."""
+    return [path for name in ("npy", "tiff16") if shows_estimate(path := format_file(estimate, name), estimate)]
 
 
 def check_formats(estimate: Path, formats: Sequence[Format]) -> None:

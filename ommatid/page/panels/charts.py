@@ -11,7 +11,8 @@ from markupsafe import Markup
 from ommatid.figures.saving import COLOURS, log_ticks, new_figure, own_style, svg_text
 from ommatid.runtime.printable import printable_label
 
-SIZE = 4.4, 3.2  # inches
+SIZE = 4.4, 3.4  # inches
+LEGEND_ROW = 0.06  # of the height
 GREY = "#808080"  # colour 0, legible on light and dark
 LOOKS: dict[str, dict[str, Any]] = {
     "line": {"linewidth": 1.6},
@@ -51,7 +52,8 @@ def chart(name: str, x: ChartAxis, y: ChartAxis, series: Sequence[ChartSeries], 
     """Return a chart as an SVG element; name : unique on its page;  description : for readers who do not see it."""
     figure = new_figure(*SIZE)
     panel = figure.subplots()
-    figure.subplots_adjust(left=0.16, right=0.98, top=0.97, bottom=0.15)
+    named = sum(bool(part.name) for part in series)
+    figure.subplots_adjust(left=0.16, right=0.96, top=0.97 - LEGEND_ROW * named, bottom=0.15)
     for part in series:
         colour = COLOURS[part.colour - 1] if part.colour else GREY
         if part.low:
@@ -62,8 +64,8 @@ def chart(name: str, x: ChartAxis, y: ChartAxis, series: Sequence[ChartSeries], 
         if axis.logarithmic:
             log_ticks(side)
     panel.grid(color=GREY, alpha=0.25)
-    if any(part.name for part in series):
-        panel.legend(fontsize=8, framealpha=0.0)
+    if named:  # above the panel, where it covers no points
+        panel.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(-0.02, 0.99))
     return Markup(svg_text(figure, f"chart-{name}", description))
 
 

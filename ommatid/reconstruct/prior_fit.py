@@ -24,6 +24,7 @@ and t where the noise is fitted, on one that is refined where the evidence is.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
 from math import ceil, exp, log
@@ -34,6 +35,7 @@ from scipy import fft, linalg
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.machine import one_thread, processors
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables.estimation import PriorTable
 
@@ -146,7 +148,7 @@ class Window:
         """Return the evidence of images with a spectrum."""
         flat = self.waves.reshape(len(self.waves), -1)
         covariance = (flat * spectrum.values.ravel()) @ flat.T
-        values, vectors = linalg.eigh((covariance + covariance.T) / 2, check_finite=False, driver="evd")
+        values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)  # of NumPy, which lets other threads run
         return Evidence(np.maximum(values, 0.0), vectors.T @ self.residual, vectors.T @ self.light, self.beside)
 
 
@@ -523,7 +525,12 @@ class _Measured:
 
 def _evidence(windows: Sequence[Window | _Picture], spectra: list[NaturalSpectrum]) -> list[list[Evidence]]:
     """Return for every spectrum the evidence of all windows."""
-    return [[window.evidence(spectrum) for window in windows] for spectrum in spectra]
+
+    def evidence(spectrum: NaturalSpectrum) -> list[Evidence]:
+        return [window.evidence(spectrum) for window in windows]
+
+    with one_thread(), ThreadPoolExecutor(processors()) as threads:
+        return list(threads.map(evidence, spectra))
 
 
 def _posteriors(

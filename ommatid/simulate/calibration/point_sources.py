@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from math import ceil, floor
+from math import ceil, lcm
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -206,10 +206,15 @@ def of_pinholes(camera: Camera, lens_type: LensType) -> VisiblePixels:
     rows: list[IntArray] = []
     columns: list[IntArray] = []
     for sub in (sub for sub in camera.sub_imagers if sub.type == lens_type):
-        first = [
-            np.array([floor(start + lens_type.ratio * number - MARGIN) for number in range(count)], dtype=np.int64)
-            for start, count in zip(sub.window, lens_type.pixels, strict=True)
-        ]
+        starts = zip(sub.window, lens_type.pixels, strict=True)
+        first = [_floors(start - MARGIN, lens_type.ratio, count) for start, count in starts]
         rows.append(np.repeat(first[0], lens_type.pixels[1]))
         columns.append(np.tile(first[1], lens_type.pixels[0]))
     return VisiblePixels(np.concatenate(rows), np.concatenate(columns), ceil(lens_type.ratio) + 2)
+
+
+def _floors(start: Fraction, step: Fraction, count: int) -> IntArray:
+    """Return the whole parts of start, start + step, ..., (count,)."""
+    unit = lcm(start.denominator, step.denominator)
+    numbers = int(start * unit) + int(step * unit) * np.arange(count, dtype=object)  # of any size
+    return (numbers // unit).astype(np.int64)

@@ -21,7 +21,7 @@ from ommatid.scenes.setup import Setup
 
 from .renderer.variant import choose
 from .renderer.world import describe
-from .sampling.passes import Tally, plan
+from .sampling.passes import plan
 from .world_view import ideal_camera, rendered_world
 
 FINER = 3  # depth is the median of 3 x 3 points of a pixel
@@ -54,15 +54,13 @@ def truth(setup: Setup) -> Truth:
     work = plan(TRUER * scene.render.sample_count, scene.render.sampler)
     renderer = Renderer(ideal_camera(camera).world, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
-    seeds = [sampler_seeds(scene.render.seed, "truth", number, work.passes + 1) for number in range(work.passes + 1)]
-    tally, (pixels,) = Tally(camera.unknowns), map(renderer.pixels, renderer.groups)
-    for seed in seeds[:-1]:
-        tally.add(renderer.expose(pixels, work.samples, [seed])[0, 0])
-    points = renderer.depths(ideal_camera(camera, FINER), seeds[-1](0))
+    mean, variance = renderer.mean_of_passes("truth", scene.render.seed, work)
+    seed = sampler_seeds(scene.render.seed, "truth", work.passes, work.passes + 1)
+    points = renderer.depths(ideal_camera(camera, FINER), seed(0))
     depth = np.median(points.reshape(camera.rows, FINER, camera.columns, FINER), axis=(1, 3))
     return Truth(
-        image=tally.mean.reshape(camera.shape),
-        variance=tally.variance.reshape(camera.shape),
+        image=mean.reshape(camera.shape),
+        variance=variance.reshape(camera.shape),
         depth=np.where(np.isfinite(depth), depth, np.nan),
         samples=work.total,
     )

@@ -1,7 +1,6 @@
 """Rendering of all sub-images: the mean of passes with seeds of their own, its variance, and the sensor's recording.
 
-A film is rendered in bands: all passes of some sensor pixels before those of the next, so that memory holds few. A
-stack is reused from its file while its fingerprint matches the scene.
+A stack is reused from its file while its fingerprint matches the scene.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -30,16 +29,11 @@ from ommatid.scenes.stack import STRAIGHT, Stack
 from ommatid.scenes.tables.sensor import SensorTable
 
 from .renderer.variant import choose, release
-from .sampling.checkpoint import Checkpoint, State, open_checkpoint
-from .sampling.passes import OverPasses, Plan, Rendering, Tally, plan, rounding_variance
+from .sampling.checkpoint import Checkpoint, open_checkpoint
+from .sampling.passes import OverPasses, Plan, Rendering, plan, rounding_variance
 from .world_view import rendered_world
 
-if TYPE_CHECKING:
-    from .renderer.rays import Pixels
-    from .renderer.renderer import Renderer
-
 NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle
-BAND = 2**22  # sensor pixels, at most, unless rays that start together are of more
 
 
 def stated_variance(camera: Camera, mean: FloatArray, variance: FloatArray, work: Plan) -> FloatArray:
@@ -106,7 +100,7 @@ def light(
     work = plan(scene.render.sample_count, scene.render.sampler) if work is None else work
     renderer = Renderer(setup.world.simulated, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
-    mean, variance = render_bands(renderer, scene.render.seed, work, progress, checkpoint)
+    mean, variance = renderer.mean_of_passes("data", scene.render.seed, work, progress, checkpoint)
     mean *= setup.camera.received
     variance *= np.square(setup.camera.received)
     first_seed = sampler_seeds(scene.render.seed, "data", 0, work.passes)(0)
@@ -170,45 +164,6 @@ def _recording(setup: Setup, sensor: SensorTable, light: FloatArray) -> Recordin
     response = np.where(dark, 0.0, electrons(setup.scene, setup.camera))
     shot = negligible_shot_noise(setup.scene, setup.camera) is None
     return record(np.where(dark, 0.0, light), response, sensor, setup.camera, setup.scene.render.seed, shot)
-
-
-def render_bands(
-    renderer: Renderer, seed: int, work: Plan, progress: Progress, checkpoint: Checkpoint | None
-) -> tuple[FloatArray, FloatArray]:
-    """Return the mean over all passes on every sensor pixel and its variance, (M,) each, which bands do not change."""
-    bands = bands_of(renderer, work.samples)
-    mean, variance, first = np.zeros(renderer.camera.measurements), np.zeros(renderer.camera.measurements), 0
-    state = State() if checkpoint is None else checkpoint.state()
-    if state:
-        mean, variance, first = state["mean"], state["variance"], int(state["band"])
-    for number, band in list(enumerate(bands))[first:]:
-        tally = Tally(sum(pixels.count for pixels in band))
-        tally.resume("light", state)
-        state = State()  # the other bands have not begun
-        for index in range(tally.count, work.passes):
-            seeds = [sampler_seeds(seed, "data", index, work.passes)]
-            tally.add(np.concatenate([renderer.expose(pixels, work.samples, seeds)[0, 0] for pixels in band]))
-            if checkpoint is not None:
-                done = {"mean": mean, "variance": variance, "band": np.array(number)}
-                checkpoint.offer(lambda done=done, tally=tally: {**done, **tally.state("light")})
-            progress((number + (index + 1) / work.passes) / len(bands))
-        start = renderer.rows(band[0].group).start + band[0].block.start
-        rows = slice(start, start + tally.mean.size)
-        mean[rows], variance[rows] = tally.mean, tally.variance
-    return mean, variance
-
-
-def bands_of(renderer: Renderer, samples: int) -> list[list[Pixels]]:
-    """Join the adjacent blocks of pixels whose rays start together to bands."""
-    bands: list[list[Pixels]] = []
-    size = 0
-    for block in (block for group in renderer.groups for block in renderer.blocks(renderer.pixels(group), samples)):
-        if not bands or size + block.count > BAND:
-            bands.append([])
-            size = 0
-        bands[-1].append(block)
-        size += block.count
-    return bands
 
 
 def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, bool]:

@@ -17,7 +17,6 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import fingerprint
-from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
@@ -26,6 +25,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.world import FROM_FILE, MILLIMETRES, WorldTable
 
 from .renderer.variant import choose
+from .sampling.passes import Plan
 
 SUB_IMAGERS, SIDE = 64, 4  # from which views are followed, at most, and how many views along each side of one
 COARSE, SAMPLES = 48, 64  # pixels along the longer side, and samples of each, of the picture that finds white
@@ -264,9 +264,7 @@ def coarse_camera(camera: Camera) -> Camera:
 
 def _brightest(renderer: Any, seed: int) -> float:
     """Return the radiance that all but the brightest pixels of a coarse picture stay below; 0 if there is no light."""
-    (group,) = renderer.groups
-    seeds = [sampler_seeds(seed, "white", 0, 1)]
-    radiance = renderer.expose(renderer.pixels(group), SAMPLES, seeds)[0, 0] / WHITE  # where a radiance of 1 is white
+    radiance = renderer.mean_of_passes("white", seed, Plan(1, SAMPLES))[0] / WHITE  # where a radiance of 1 is white
     white = float(np.percentile(radiance, BRIGHT))
     return white if 0 < white < np.inf else 0.0
 

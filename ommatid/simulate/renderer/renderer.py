@@ -18,14 +18,17 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.streams import block_seed
+from ommatid.runtime.progress import Progress, no_progress
+from ommatid.runtime.streams import Rays as Kind
+from ommatid.runtime.streams import block_seed, sampler_seeds
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.tables.estimation import Sampler
 
-from ..sampling.passes import Plan, has_equal_boxes, margin
+from ..sampling.checkpoint import Checkpoint, State
+from ..sampling.passes import Plan, Tally, has_equal_boxes, margin
 from ..sampling.samplers import fitting
 from .averages import Averages
 from .draws import SobolDraws
@@ -145,6 +148,33 @@ class Renderer:
     def blocks(self, pixels: Pixels, samples: int) -> list[Pixels]:
         """Divide pixels into blocks whose rays, `samples` a pixel, start together: one on scalar."""
         return pixels.blocks(samples) if self.is_fast else [pixels]
+
+    def mean_of_passes(
+        self, rays: Kind, seed: int, work: Plan, progress: Progress = no_progress, checkpoint: Checkpoint | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the mean over passes with seeds of their own on every sensor pixel, and its variance: (M,) each.
+
+        All passes of the pixels whose rays start together come before those of the next, so that memory holds few.
+        """
+        blocks = [block for group in self.groups for block in self.blocks(self.pixels(group), work.samples)]
+        (mean, variance), first = np.zeros((2, self.camera.measurements)), 0
+        state = State() if checkpoint is None else checkpoint.state()
+        if state:
+            mean, variance, first = state["mean"], state["variance"], int(state["block"])
+        for number, block in list(enumerate(blocks))[first:]:
+            tally = Tally(block.count)
+            tally.resume("light", state)
+            state = State()  # the other blocks have not begun
+            for index in range(tally.count, work.passes):
+                seeds = [sampler_seeds(seed, rays, index, work.passes)]
+                tally.add(self.expose(block, work.samples, seeds)[0, 0])
+                if checkpoint is not None:
+                    done = {"mean": mean, "variance": variance, "block": np.array(number)}
+                    checkpoint.offer(lambda done=done, tally=tally: {**done, **tally.state("light")})
+                progress((number + (index + 1) / work.passes) / len(blocks))
+            rows = self.rows(block.group).start + block.numbers
+            mean[rows], variance[rows] = tally.mean, tally.variance
+        return mean, variance
 
     def expose(self, pixels: Pixels, samples: int, seeds: Sequence[Seed], points: Points = "sampler") -> FloatArray:
         """Return the readings of pixels for each picture and pass: (channels, passes, pixels).

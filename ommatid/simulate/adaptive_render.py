@@ -42,18 +42,19 @@ from .renderer.variant import choose
 from .sampling.checkpoint import Checkpoint, State
 from .sampling.passes import (
     AVERAGED,
+    LEAPS,
     MOST_SAMPLES,
     Plan,
     Rendering,
+    SampleLaw,
     Tally,
     cells_of,
     exact_plan,
     on_grid,
-    power_of_two_plan,
     rounding_variance,
     samples_within,
 )
-from .sampling.sample_law import LEAPS, SampleLaw
+from .sampling.samplers import SOBOL
 from .world_view import rendered_world
 
 if TYPE_CHECKING:
@@ -67,7 +68,6 @@ MOST = 2**20  # samples per pixel of a round, at most,
 LEAP = 4  # and relative to the last one
 MOST_EXACT = 2**16  # samples per pixel of a pass whose sums are float64
 MOST_PASSES = 1024  # of all rounds of a sub-imager: they number its seeds
-SOBOL = "sobol"  # in records, Sobol's points of the pupil, and of the pixel where its averages are not exact
 TABULATED = 1e-5  # of the light of a white target, deviation by the tables that rays of a point spread are drawn from
 REACHED = "reached"  # how a sub-imager ends; otherwise the reason why it could not:
 TIME, SAMPLES, FLOAT32 = "render.time is over", "no more samples are taken", "float32 rounds as much"
@@ -290,10 +290,8 @@ class AdaptiveRounds:
 
     def _grid(self, index: int, samples: int, most: int = MOST_SAMPLES) -> Plan:
         """Return a plan that fits the edges of pixels of f or Sobol's points, where the sampler can make use of it."""
-        if self._sobol[index]:
-            return power_of_two_plan(samples, most)
-        cells = cells_of(self._camera.sub_imagers[index].type)
-        return on_grid(samples, self._scene.render.sampler, cells, most)
+        sampler = SOBOL if self._sobol[index] else self._scene.render.sampler
+        return on_grid(samples, sampler, cells_of(self._camera.sub_imagers[index].type), most)
 
     def state(self) -> State:
         """Return the arrays of a checkpoint."""

@@ -37,12 +37,12 @@ from ommatid.simulate.sampling.passes import (
     EXACT_PASSES,
     Plan,
     Rendering,
+    SampleLaw,
     cells_of,
     on_grid,
     rounding_variance,
     samples_within,
 )
-from ommatid.simulate.sampling.sample_law import SampleLaw
 
 from ..conftest import Command
 from ..examples import GALLERY, SLOW_SCALAR, THREE, VARIANTS, needs, scene

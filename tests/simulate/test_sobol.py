@@ -17,7 +17,7 @@ from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.draws import DIMENSIONS, SobolDraws, sobol_points
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate
-from ommatid.simulate.sampling.passes import power_of_two_plan
+from ommatid.simulate.sampling.passes import on_grid
 
 from ..examples import needs, with_optics
 
@@ -77,7 +77,7 @@ def test_points_are_uniform_and_those_of_streams_and_seeds_are_unrelated() -> No
 
 def test_numbers_of_samples_are_powers_of_two() -> None:
     for samples in (1, 16, 256, 1000, 40000, 2**20):
-        work = power_of_two_plan(samples, 4096)
+        work = on_grid(samples, "sobol")
         assert work.total >= samples
         assert work.samples & (work.samples - 1) == 0
         assert work.samples <= 4096

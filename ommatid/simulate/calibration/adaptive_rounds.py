@@ -21,8 +21,7 @@ from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import choose
 from ..sampling.checkpoint import Checkpoint
-from ..sampling.passes import FEWEST_PASSES, MOST_SAMPLES, Plan, Plans, cells_of, on_grid
-from ..sampling.sample_law import SampleLaw
+from ..sampling.passes import FEWEST_PASSES, MOST_SAMPLES, Plan, Plans, SampleLaw, cells_of, on_grid
 from .entries import rendered_model
 
 GOAL = 0.1  # of all the rest of the expected error: what the uncertainty of H may add

@@ -26,8 +26,7 @@ from ommatid.scenes.shrinkage import shrink_variances
 
 from ..render import light
 from ..renderer.variant import choose, unusable_reason
-from ..sampling.passes import BATCHES, Plan, Plans, plan
-from ..sampling.sample_law import SampleLaw
+from ..sampling.passes import BATCHES, Plan, Plans, SampleLaw, plan
 from ..sampling.samplers import fitting
 from .adaptive_rounds import LEAST, plans_of
 from .entries import rendered_model

@@ -1,4 +1,4 @@
-"""Rendering in passes with independent seeds, so that every mean has an estimated variance.
+"""Rendering in passes with independent seeds: their plans, means with variances, and the samples that a goal takes.
 
 Passes are divided over grids that the sampler fills, over a power of two of Sobol's points, or over a grid that leaves
 no error: behind an ideal pinhole a pixel averages a constant over each cell that lies within one pixel of f, wherever
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from math import ceil, isqrt, lcm
-from typing import Any
+from math import ceil, isqrt, lcm, log
+from typing import Any, Literal
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from .samplers import filling, fitting
 BATCHES = 8  # passes are also averaged in this many batches, whose scatter shows the correlation of errors
 FEWEST_PASSES = 16
 MOST_SAMPLES = 4096  # in one pass: the renderer's sums are float32
-JITTERED: tuple[Sampler, ...] = ("multijitter", "stratified")  # one sample in every cell of a grid
+JITTERED = ("multijitter", "stratified")  # one sample in every cell of a grid
 MOST_CELLS = 16  # along a side of a grid that fits the edges of pixels of f
 ROUNDING = 2.0**-24  # relative, of float32
 EXACT_PASSES = 2  # of such a grid
@@ -33,6 +33,9 @@ ROUNDINGS = 16  # of float32, from the sensor to the target: more than add up on
 WIDEST_MARGIN = 0.125  # of a cell, beyond which float32 does not resolve the cells
 MOST_PIXELS = 64  # of f, of a sensor pixel along an axis, whose averages are computed
 MOST_PARTS = 4  # of a pixel of f along an axis, likewise
+STRATIFIED, INDEPENDENT = 1.5, 1.0  # exponents before they are measured: of strata only those along edges err
+STEEPEST = 2.0  # largest exponent that a measurement is trusted with
+LEAPS = (2.0, 64.0)  # least and largest growth of the samples from one round to the next
 
 
 @dataclass(frozen=True)
@@ -51,13 +54,45 @@ class Plan:
 Plans = dict[str, Plan]  # by the name of a lens type
 
 
+@dataclass(frozen=True)
+class SampleLaw:
+    """A variance that falls as 1 / passes and as samples^-exponent, with the samples of a pass."""
+
+    exponent: float = INDEPENDENT
+
+    @staticmethod
+    def expected(sampler: Sampler) -> SampleLaw:
+        """Return the law of a sampler through pinholes."""
+        return SampleLaw(INDEPENDENT if sampler == "independent" else STRATIFIED)
+
+    @staticmethod
+    def measured(fall: float, growth: float) -> SampleLaw:
+        """Return the law of a variance that fell by a factor while the samples grew by another, within limits."""
+        return SampleLaw(min(max(log(fall) / log(growth), INDEPENDENT), STEEPEST))
+
+    def ratio(self, few: Plan, many: Plan) -> float:
+        """Return the variance by the second plan over that by the first."""
+        return few.passes / many.passes * (few.samples / many.samples) ** self.exponent
+
+    def samples(self, factor: float, last: Plan, most: int) -> int:
+        """Predict the samples per pixel of a round that divides the variance of the last one by a factor.
+
+        most : in a pass. A round takes at least twice as many samples as the last one, and not too many more.
+        """
+        each = last.samples * (factor * last.passes / FEWEST_PASSES) ** (1 / self.exponent)
+        total = FEWEST_PASSES * each
+        if each > most:
+            total = most * last.passes * factor * (last.samples / most) ** self.exponent
+        return ceil(min(max(total, LEAPS[0] * last.total), LEAPS[1] * last.total))
+
+
 def plan(samples: int, sampler: Sampler = "multijitter") -> Plan:
     """Divide `samples` per pixel over at least 16 passes, rounded up to a grid that the sampler can fill."""
     passes = max(FEWEST_PASSES, BATCHES * ceil(samples / MOST_SAMPLES / BATCHES))
     return Plan(passes, fitting(sampler, ceil(samples / passes)))
 
 
-def on_grid(samples: int, sampler: Sampler, cells: int = 1, most: int = MOST_SAMPLES) -> Plan:
+def on_grid(samples: int, sampler: Sampler | Literal["sobol"], cells: int = 1, most: int = MOST_SAMPLES) -> Plan:
     """Divide at least `samples` per pixel over passes of at most `most`, on grids of a multiple of `cells` a side.
 
     Where a sensor pixel sees cells x cells whole pixels of f, such a grid puts equally many samples into each of them,
@@ -181,15 +216,6 @@ def samples_within(values: FloatArray, variance: FloatArray) -> int:
     """Return the largest number of samples, at least 1, whose `rounding_variance` does not exceed `variance`."""
     sums = (np.sqrt(variance) / ROUNDING - 1) / np.maximum(np.abs(values), ROUNDING)
     return max(int(8 * (float(sums.min()) - 1)), 1)
-
-
-def power_of_two_plan(samples: int, most: int) -> Plan:
-    """Divide at least `samples` per pixel over passes of a power of two, and of at most `most`."""
-    each = 1 << (ceil(samples / FEWEST_PASSES) - 1).bit_length()
-    if each <= most:
-        return Plan(FEWEST_PASSES, each)
-    each = 1 << (most.bit_length() - 1)
-    return Plan(max(FEWEST_PASSES, BATCHES * ceil(samples / each / BATCHES)), each)
 
 
 # Exact averages over pixels, one a pass, moved up, down, left and right by what float32 may round.

@@ -8,21 +8,26 @@ from __future__ import annotations
 
 from functools import cache
 from math import isqrt
+from typing import Literal
 
 from ommatid.scenes.tables.estimation import Sampler
 
+SOBOL: Literal["sobol"] = "sobol"  # points that are no sampler of Mitsuba's
 RELATED_DRAWS: tuple[Sampler, ...] = ("stratified", "ldsampler")  # successive draws of a ray are far from independent
 
 
-def fitting(sampler: Sampler, samples: int) -> int:
+def fitting(sampler: Sampler | Literal["sobol"], samples: int) -> int:
     """Return the least number of samples, no fewer than `samples`, that fills a sampler's grid.
 
     Any number for independent samples; a grid as square as possible for multijitter; squares for stratified; squares
-    of primes for orthogonal arrays (strength 2, Bose); powers of four for ldsampler, whose two sequences are binary.
+    of primes for orthogonal arrays (strength 2, Bose); powers of four for ldsampler, whose two sequences are binary;
+    powers of two for Sobol's points.
     """
     samples = max(samples, 1)
     if sampler == "independent":
         return samples
+    if sampler == SOBOL:
+        return 1 << (samples - 1).bit_length()
     side = isqrt(samples)
     if sampler == "multijitter":
         return side * -(-samples // side)
@@ -41,7 +46,7 @@ def fitting(sampler: Sampler, samples: int) -> int:
 
 
 @cache
-def filling(sampler: Sampler, most: int) -> int:
+def filling(sampler: Sampler | Literal["sobol"], most: int) -> int:
     """Return the largest number of samples up to `most` that fills a sampler's grid, or the least one if none does."""
     return next(
         (samples for samples in range(most, 0, -1) if fitting(sampler, samples) == samples), fitting(sampler, 1)

@@ -143,7 +143,7 @@ def observe(model: Model, images: ArrayLike, seed: int, scene: Scene | str | Pat
     scene : whose [noise] or [sensor] records, and whose [prior] and [estimator] apply later; None: that of the model
     Raises InputError for other shapes, for values that are not finite, and if scene and model are of different cameras.
     """
-    from ommatid.simulate.observe import observed_stacks
+    from ommatid.simulate.render import observed_stacks
 
     check_type("model", model, Model, "read_model")
     setup = Setup.from_scene(model.scene if scene is None else _scene(scene))

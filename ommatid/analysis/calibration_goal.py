@@ -25,7 +25,7 @@ from ommatid.scenes.optics.radiometry import electrons, predicted_noise
 from ommatid.scenes.scene import Scene, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
-from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
+from ommatid.simulate.calibrate import StoppingRule
 from ommatid.simulate.render import exposed
 
 NEGLIGIBLE = 0.03  # variance relative to the other noise of a measurement

@@ -20,8 +20,7 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import StudyModel
-from ommatid.simulate.calibrate import cached_model
-from ommatid.simulate.calibration.adaptive_rounds import StoppingRule
+from ommatid.simulate.calibrate import StoppingRule, cached_model
 from ommatid.simulate.ideal import ideal_model, true_model
 
 LABELS = {

@@ -1,11 +1,13 @@
 """Rendering of all sub-images: the mean of passes with seeds of their own, its variance, and the sensor's recording.
 
-A stack is reused from its file while its fingerprint matches the scene.
+A stack is reused from its file while its fingerprint matches the scene. Those of given images are H f with the noise of
+the scene's sensor, where nothing is rendered.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import index
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -14,15 +16,17 @@ import numpy as np
 from scipy import ndimage
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.errors import InputError, shortened_repr
 from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.runtime.streams import sampler_seeds
+from ommatid.runtime.streams import Purpose, derived_seed, sampler_seeds
 from ommatid.runtime.versions import versions
 from ommatid.scenes import stack
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.model import Model
 from ommatid.scenes.optics.negligible import negligible_shot_noise
 from ommatid.scenes.recording import Recording
-from ommatid.scenes.scene import TRUTH
+from ommatid.scenes.scene import TRUTH, with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import posterior_variances_among
 from ommatid.scenes.stack import STRAIGHT, Stack
@@ -164,6 +168,46 @@ def _recording(setup: Setup, sensor: SensorTable, light: FloatArray) -> Recordin
     response = np.where(dark, 0.0, electrons(setup.scene, setup.camera))
     shot = negligible_shot_noise(setup.scene, setup.camera) is None
     return record(np.where(dark, 0.0, light), response, sensor, setup.camera, setup.scene.render.seed, shot)
+
+
+def observed_stacks(setup: Setup, model: Model, images: FloatArray, seed: int) -> list[Stack]:
+    """Return the stacks of images, (..., rows, columns) on the grid of H, in the order of the leading axes.
+
+    seed : of the noise; the stream of an image follows from the seed and its number
+    Raises InputError for other shapes, values or seeds.
+    """
+    _check(images, setup, model)
+    pictures = images.reshape(-1, *model.camera.shape)
+    return [_observed(setup, model, picture, _seed(seed, number)) for number, picture in enumerate(pictures)]
+
+
+def _check(images: FloatArray, setup: Setup, model: Model) -> None:
+    shape = model.camera.shape
+    if images.shape[-2:] != shape:
+        raise InputError(
+            f"images: expected [..., {shape[0]}, {shape[1]}], the grid of H, got {list(images.shape)}; set"
+            " target.shape of the scene to the shape of your images, and calibrate it"
+        )
+    if not np.isfinite(images).all():
+        raise InputError("images: expected finite values, got NaN or infinity; replace them by numbers")
+    if setup.scene.sensor is not None and (images < 0).any():
+        raise InputError(f"images: a [sensor] counts electrons, expected values of 0 or more, got {images.min():g}")
+
+
+def _seed(seed: int, number: int) -> int:
+    try:
+        return derived_seed(index(seed), Purpose.OBSERVATION, number)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"seed: expected a whole number of 0 or more, got {shortened_repr(seed)}") from error
+
+
+def _observed(setup: Setup, model: Model, image: FloatArray, seed: int) -> Stack:
+    start, scene = perf_counter(), setup.scene
+    light = model.forward(image)
+    light = light if scene.sensor is None else np.maximum(light, 0.0)  # entries of a calibrated H may be negative
+    seeded = replace(setup, scene=with_tables(scene, render=scene.render.model_copy(update={"seed": seed})))
+    record = {"method": "observed", "seed": seed, "seconds": perf_counter() - start, "versions": versions()}
+    return exposed(seeded, light, np.zeros(light.size), record)
 
 
 def cached_stack(path: Path, setup: Setup, progress: Progress) -> tuple[Stack, bool]:

@@ -200,7 +200,6 @@ def test_a_pinhole_camera_imports_no_modules_of_lenses() -> None:
         "renderer.crosstalk",
         "renderer.real_lens",
         "renderer.world",
-        "calibration.ray_transport",
     )
     absent = existing(
         *(f"ommatid.scenes.optics.{name}" for name in optics), *(f"ommatid.simulate.{name}" for name in simulated)

@@ -29,8 +29,7 @@ from ommatid.simulate.adaptive_render import (
     TIME,
     render_until,
 )
-from ommatid.simulate.calibrate import cached_model, calibrate
-from ommatid.simulate.calibration.adaptive_rounds import GOAL, StoppingRule
+from ommatid.simulate.calibrate import GOAL, StoppingRule, cached_model, calibrate
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import cached_stack, render
 from ommatid.simulate.sampling.passes import (

@@ -14,9 +14,9 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints, KernelPlaces
 from ommatid.scenes.tables.camera import ToleranceTable
+from ommatid.simulate.calibration.fit.kernel_fit import KernelFit, fit_kernels, refusal
 from ommatid.simulate.calibration.responses import Responses
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.kernel_fit.kernel_fit import KernelFit, fit_kernels, refusal
 from tests.examples import with_optics
 
 PASSES, RAYS = 16, 256

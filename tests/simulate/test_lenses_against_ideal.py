@@ -16,8 +16,7 @@ from scipy import sparse, stats
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.optics.field import optics_of
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.calibration.ray_transport import one_pass
-from ommatid.simulate.calibration.responses import measured
+from ommatid.simulate.calibration.responses import measured, one_pass
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import choose

@@ -9,8 +9,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.calibration.ray_transport import one_pass
-from ommatid.simulate.calibration.responses import measured
+from ommatid.simulate.calibration.responses import measured, one_pass
 from ommatid.simulate.render import light
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.sampling.passes import Plan

@@ -24,14 +24,13 @@ from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
+from ..calibrate import LEAST, plans_of
 from ..render import light
 from ..renderer.variant import choose, unusable_reason
 from ..sampling.passes import BATCHES, Plan, Plans, SampleLaw, plan
 from ..sampling.samplers import fitting
-from .adaptive_rounds import LEAST, plans_of
 from .entries import rendered_model
-from .ray_transport import positions_of
-from .responses import same_plans
+from .responses import positions_of, same_plans
 
 MOST_RAYS = 2**26  # of a pilot: some seconds
 FEWEST_SAMPLES = 16  # per pixel in a pass

@@ -10,7 +10,7 @@ measured entry by entry, pixel by pixel, and named in the record.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,10 +25,10 @@ from ommatid.scenes.model import MeasuredRows
 
 from ..responses import Responses, Subsets
 from .chart import ChartRows, Explanation, chart_of, chart_rows, freedom_of, side_for_kernels
-from .view_fit import SIGNIFICANCE, ViewFit, fit_views, predicted
+from .view_fit import SIGNIFICANCE, fit_views, predicted
 
 if TYPE_CHECKING:
-    from ...kernel_fit.kernel_fit import KernelFit
+    from .kernel_fit import KernelFit
 
 FEW = 8  # rays of a cell, below which its weight hardly grows: single rays there would decide
 STRAY = 0.5  # rays that each cell may miss or have in excess, by rounding of positions to float32
@@ -70,8 +70,8 @@ class FittedCalibration:
 @dataclass(frozen=True)
 class _TypeFit:
     views: Views
-    fit: ViewFit | None
-    explanations: list[Explanation]
+    chances: dict[str, float] = field(default_factory=dict[str, float])
+    explanations: list[Explanation] = field(default_factory=list[Explanation])
     kernels: KernelFit | None = None
 
 
@@ -84,7 +84,7 @@ def has_chart(camera: Camera, lens_type: LensType, with_kernels: bool = True) ->
     """Return True if few numbers may explain a lens type, so that a chart of its pixels is measured first."""
     if is_sharp(camera, lens_type) or not with_kernels:
         return is_sharp(camera, lens_type)
-    from ...kernel_fit.kernel_fit import refusal
+    from .kernel_fit import refusal
 
     return not refusal(camera, lens_type)
 
@@ -156,26 +156,26 @@ def _fit_type(
     recorded: bool,
 ) -> _TypeFit:
     if not charted:
-        return _TypeFit(views_as_designed(subs, explained=False), None, [])
+        return _TypeFit(views_as_designed(subs, explained=False))
     if not is_sharp(camera, lens):
-        from ...kernel_fit.kernel_fit import fit_kernels
+        from .kernel_fit import fit_kernels
 
         kernels = fit_kernels(responses, camera, lens, _chart(camera, lens))
-        return _TypeFit(views_as_designed(subs, kernels.accepted), None, [], kernels)
+        return _TypeFit(views_as_designed(subs, kernels.accepted), kernels=kernels)
     pointers = responses.matrix.indptr
     batches = responses.batches[:, int(pointers[rows.start]) : int(pointers[rows.stop])]
     charts = chart_rows(camera, lens, responses.matrix[rows], batches)
     try:
-        fit = fit_views(camera, subs, charts, rays, matched=recorded)
+        views, chances = fit_views(camera, subs, charts, rays, matched=recorded)
     except InputError:  # rows that no view has led to a distortion that folds the image
-        return _TypeFit(views_as_designed(subs, explained=False), None, [])
-    models = [predicted(camera, sub, fit.numbers[n], charts[n]) for n, sub in enumerate(subs)]
+        return _TypeFit(views_as_designed(subs, explained=False))
+    models = [predicted(camera, sub, views.numbers[n], charts[n]) for n, sub in enumerate(subs)]
     explanations = [explanation(chart, model, rays, recorded) for chart, model in zip(charts, models, strict=True)]
     single = -np.expm1(np.log1p(-SIGNIFICANCE) / len(camera.sub_imagers))
     explained = np.array([each.chance >= single for each in explanations])
-    numbers = np.where(explained[:, None], fit.numbers, designed_views(subs))
-    own, shared = (np.where(explained[:, None, None], each, 0.0) for each in (fit.own, fit.shared))
-    return _TypeFit(Views(numbers, explained, own, shared, fit.structure), fit, explanations)
+    numbers = np.where(explained[:, None], views.numbers, designed_views(subs))
+    own, shared = (np.where(explained[:, None, None], each, 0.0) for each in (views.own, views.shared))
+    return _TypeFit(Views(numbers, explained, own, shared, views.structure), chances, explanations)
 
 
 def _rest(
@@ -209,11 +209,11 @@ def _record(camera: Camera, fits: dict[str, _TypeFit], subsets: Subsets) -> dict
         "accepted": int(explained.sum()),
         "refused": [name for name, good in zip(names, explained.tolist(), strict=True) if not good],
         "structure": {name: dict(zip(UNITS, fit.views.structure, strict=True)) for name, fit in fits.items()},
-        "chances": {name: fit.fit.chances for name, fit in fits.items() if fit.fit is not None},
+        "chances": {name: fit.chances for name, fit in fits.items() if fit.chances},
         "parameters": {
             name: _statistics(fit, subs)
             for (name, fit), subs in zip(fits.items(), _by_type(camera), strict=True)
-            if fit.fit is not None and fit.views.explained.any()
+            if fit.chances and fit.views.explained.any()
         },
         "kernels": {name: fit.kernels.record() for name, fit in fits.items() if fit.kernels is not None},
         "units": UNITS,

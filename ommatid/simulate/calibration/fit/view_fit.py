@@ -17,6 +17,7 @@ from scipy import sparse, special
 
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.scenes.camera import Camera
+from ommatid.scenes.fitted.fitted_matrix import Views
 from ommatid.scenes.fitted.view import (
     COLUMN,
     COUNT,
@@ -141,17 +142,6 @@ def _expected(
 
 
 @dataclass(frozen=True)
-class ViewFit:
-    """Fitted views of a lens type's sub-imagers; see `fitted_matrix.Views`."""
-
-    numbers: FloatArray
-    own: FloatArray
-    shared: FloatArray
-    structure: Structure
-    chances: dict[str, float]
-
-
-@dataclass(frozen=True)
 class Centroids:
     """The linear problem of one sub-imager: moves of its centroids, rows first and then columns of f.
 
@@ -181,8 +171,8 @@ class ViewSolution:
 
 def fit_views(
     camera: Camera, subs: list[SubImager], charts: list[ChartRows], rays: int, *, matched: bool = False
-) -> ViewFit:
-    """Fit the views of a lens type's sub-imagers.
+) -> tuple[Views, dict[str, float]]:
+    """Fit the views of a lens type's sub-imagers. Returns the chances of the tests of their structure, too.
 
     rays : per pixel, of all passes;  matched : as of `_centroids`, where entries without light are noisy, too
     """
@@ -216,8 +206,8 @@ def fit_views(
     numbers, problems, _ = iterated(numbers, FREE, matched)
     structure, chances = _structure(problems)
     numbers, problems, solution = iterated(numbers, structure, matched)
-    doubtful = _errors_of_design(problems, structure, solution)
-    return ViewFit(numbers, doubtful[0] * units[:, :, None], doubtful[1] * units[:, :, None], structure, chances)
+    own, shared = (each * units[:, :, None] for each in _errors_of_design(problems, structure, solution))
+    return Views(numbers, np.ones(len(subs), dtype=np.bool_), own, shared, structure), chances
 
 
 def _errors_of_design(

@@ -63,6 +63,14 @@ def corner_offset(camera: Camera, sub: SubImager) -> tuple[float, float]:
     return -columns / 2 * camera.pixel_pitch, -rows / 2 * camera.pixel_pitch
 
 
+def pixel_middles(camera: Camera, sub: SubImager, pose: Pose) -> FloatArray:
+    """Return the middles of a sub-imager's pixels from its lens: (rows, columns, 3)."""
+    (left, top), (rows, columns) = corner_offset(camera, sub), sub.type.pixels
+    u = (left + (np.arange(columns) + 0.5) * camera.pixel_pitch)[None, :, None]
+    v = (top + (np.arange(rows) + 0.5) * camera.pixel_pitch)[:, None, None]
+    return pose.middle + u * pose.axes[:, 0] + v * pose.axes[:, 1]
+
+
 def misalignments(camera: Camera) -> tuple[Misalignment, ...]:
     """The misalignment of each sub-imager, drawn from the camera's tolerance.
 

@@ -25,7 +25,7 @@ from ..fitted.kernel_shapes import KernelShapes
 from ..fitted.kernels import KernelFootprints, KernelPlaces, basis, terms
 from ..lens_type import LensType
 from .field import FINEST, Optics, bands, check_waves, light_reach, optics_of
-from .lens_matrix import blur_of, matrix, row_by_rays, row_by_waves
+from .lens_matrix import blur_of, edges_at, matrix, row_by_rays, row_by_waves
 from .point_spread import point_spread
 
 # Nodes along a side of a quadrant, and degrees for them.
@@ -65,7 +65,7 @@ class _FieldRows:
 
     def _row(self, field: Optics, x: float, y: float, beside: FloatArray) -> FloatArray:
         camera, lens_type, wide = self.places.camera, self.places.lens_type, self.places.width
-        edges = tuple(_edges(camera, field, x, y, lens_type) - (beside - wide / 2)[:, None])
+        edges = tuple(edges_at(camera, field, lens_type, np.array(x), np.array(y)) - (beside - wide / 2)[:, None])
         blur, pitch, height = blur_of(camera, lens_type), camera.target_pitch, float(np.hypot(x, y))
         angle = float(np.arctan2(-x, y))
         if field.rays_suffice:
@@ -88,13 +88,6 @@ class _FieldRows:
 def _nodes(count: int) -> FloatArray:
     """Return Gauss and Legendre's nodes in the unit interval."""
     return (1 + np.polynomial.legendre.leggauss(count)[0]) / 2
-
-
-def _edges(camera: Camera, field: Optics, x: float, y: float, lens_type: LensType) -> FloatArray:
-    """Return the edges of a footprint in pixels of f from the lens's axis, by rows and by columns: (2, 2)."""
-    tall, wide = (camera.pixel_pitch / 2 * float(part) * np.array([-1.0, 1.0]) for part in lens_type.open)
-    across, down = field.chief_ray(x + wide, np.full(2, y))[0], field.chief_ray(np.full(2, x), y + tall)[1]
-    return -np.stack([down, across]) / camera.target_pitch
 
 
 @lru_cache(maxsize=16)
@@ -144,7 +137,7 @@ def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[Optics, flo
     corner = np.array(places.extent) * places.scale
     x, y = (float(each) for each in corner[::-1] * camera.target_pitch * camera.optical_magnification(lens_type))
     halves = np.outer([float(side) / 2 for side in lens_type.footprint], [-1.0, 1.0])
-    edges = (np.sort(_edges(camera, field, x, y, lens_type), axis=1) for field, _ in fields)
+    edges = (np.sort(edges_at(camera, field, lens_type, np.array(x), np.array(y)), axis=1) for field, _ in fields)
     moved = max(float(np.abs(each - corner[:, None] - halves).max()) for each in edges)
     return ceil(light_reach(camera, lens_type) + moved) + 1
 

@@ -30,7 +30,7 @@ from ommatid.runtime.machine import check_memory
 from ..camera import Camera
 from ..constants import DEVIATIONS
 from ..lens_type import LensType
-from ..pose import corner_offset, pose_of
+from ..pose import pixel_middles, pose_of
 from .field import Optics, bands, check_waves, optics_of
 from .wavefront import Wavefront
 
@@ -84,22 +84,24 @@ def _band(
 
 def _pixels(camera: Camera, lens_type: LensType, field: Optics) -> _PixelFootprints:
     parts: list[FloatArray] = []
-    tall, wide = (camera.pixel_pitch / 2 * float(part) for part in lens_type.open)
-    for sub in camera.sub_imagers:
-        if sub.type != lens_type:
-            continue
-        pose = pose_of(sub)
-        row, column = (index.ravel() + 0.5 for index in np.indices(lens_type.pixels))
-        u, v = corner_offset(camera, sub)
-        points = pose.axes @ np.stack([u + column * camera.pixel_pitch, v + row * camera.pixel_pitch])
-        x, y, _ = pose.middle[:, None] + points
-        left, right = (sub.lens[0] + field.chief_ray(x + step, y)[0] for step in (-wide, wide))
-        upper, lower = (sub.lens[1] + field.chief_ray(x, y + step)[1] for step in (-tall, tall))
-        columns = [camera.columns / 2 - edge / camera.target_pitch for edge in (left, right)]
-        rows = [camera.rows / 2 - edge / camera.target_pitch for edge in (upper, lower)]
-        parts.append(np.stack([x, y, *rows, *columns]))
+    for sub in (sub for sub in camera.sub_imagers if sub.type == lens_type):
+        x, y, _ = pixel_middles(camera, sub, pose_of(sub)).reshape(-1, 3).T
+        down, across = edges_at(camera, field, lens_type, x, y)
+        rows = camera.rows / 2 - sub.lens[1] / camera.target_pitch + down
+        parts.append(np.stack([x, y, *rows.T, *(camera.columns / 2 - sub.lens[0] / camera.target_pitch + across).T]))
     x, y, *edges = np.concatenate(parts, axis=1)
     return _PixelFootprints(x, y, np.stack(edges[:2], axis=1), np.stack(edges[2:], axis=1), blur_of(camera, lens_type))
+
+
+def edges_at(camera: Camera, field: Optics, lens_type: LensType, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the edges of the footprints of pixels at (x, y) from the lens's axis, in pixels of f: (2, ..., 2).
+
+    Down first, and then across, from the point of the target on the axis.
+    """
+    tall, wide = (camera.pixel_pitch / 2 * float(part) for part in lens_type.open)
+    down = np.stack([field.chief_ray(x, y + side)[1] for side in (-tall, tall)], axis=-1)
+    across = np.stack([field.chief_ray(x + side, y)[0] for side in (-wide, wide)], axis=-1)
+    return -np.stack([down, across]) / camera.target_pitch
 
 
 def blur_of(camera: Camera, lens_type: LensType) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from ommatid.runtime.errors import InputError
 from ..camera import Camera
 from ..constants import WHITE
 from ..lens_type import SubImager
-from ..pose import Pose, corner_offset, poses
+from ..pose import Pose, pixel_middles, poses
 from ..recording import clips_dark_noise, dark_electrons, expected_recording, saturation_electrons
 from ..scene import Scene
 from ..tables.sensor import SensorTable
@@ -53,26 +53,15 @@ def relative_illumination(camera: Camera, sub: SubImager, pose: Pose) -> FloatAr
     Light of a lens of area A at the distance r is cos(at the lens) cos(at the sensor) A / r^2; the two angles differ
     where the patch is tilted, and otherwise this is the cos^4 law of the chief ray.
     """
-    points, along_normal = _pixel_places(camera, sub, pose)
+    points, normal = pixel_middles(camera, sub, pose), np.cross(pose.axes[:, 0], pose.axes[:, 1])
     squared = np.square(points).sum(axis=-1)
-    return (np.abs(points[..., 2] * along_normal) * sub.depth**2 / squared**2).ravel()
+    return (np.abs(points[..., 2] * (points @ normal)) * sub.depth**2 / squared**2).ravel()
 
 
 def chief_ray_angles(camera: Camera, sub: SubImager, pose: Pose) -> FloatArray:
     """Angles, rad, at which a sub-imager's pixels receive the rays through the middle of its lens: (its pixels,)."""
-    points, along_normal = _pixel_places(camera, sub, pose)
-    aside = np.linalg.norm(np.cross(points, np.cross(pose.axes[:, 0], pose.axes[:, 1])), axis=-1)
-    return np.arctan2(aside, np.abs(along_normal)).ravel()
-
-
-def _pixel_places(camera: Camera, sub: SubImager, pose: Pose) -> tuple[FloatArray, FloatArray]:
-    """Return the middles of pixels from their lens, (rows, columns, 3), and these along the normal of the patch."""
-    rows, columns = sub.type.pixels
-    left, top = corner_offset(camera, sub)
-    u = (left + (np.arange(columns) + 0.5) * camera.pixel_pitch)[None, :, None]
-    v = (top + (np.arange(rows) + 0.5) * camera.pixel_pitch)[:, None, None]
-    points = pose.middle + u * pose.axes[:, 0] + v * pose.axes[:, 1]
-    return points, points @ np.cross(pose.axes[:, 0], pose.axes[:, 1])
+    points, normal = pixel_middles(camera, sub, pose), np.cross(pose.axes[:, 0], pose.axes[:, 1])
+    return np.arctan2(np.linalg.norm(np.cross(points, normal), axis=-1), np.abs(points @ normal)).ravel()
 
 
 def _acceptance(scene: Scene, camera: Camera, sub: SubImager, pose: Pose) -> FloatArray | float:
@@ -120,7 +109,7 @@ def _through_surfaces(camera: Camera, sub: SubImager, pose: Pose) -> FloatArray:
     """Projected solid angle, sr, of a lens with surfaces at each pixel of a sub-imager, (its pixels,), by its rays."""
     from .field import optics_of
 
-    points = _pixel_places(camera, sub, pose)[0]
+    points = pixel_middles(camera, sub, pose)
     return optics_of(camera, sub.type, None).weight(np.hypot(points[..., 0], points[..., 1]).ravel())
 
 

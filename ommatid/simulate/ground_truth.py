@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.files import cached, digest, fingerprint
-from ommatid.runtime.streams import sampler_seeds
 from ommatid.runtime.versions import versions
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats.exr import read
 from ommatid.scenes.formats.picture import write_truth
 from ommatid.scenes.setup import Setup
@@ -55,15 +56,26 @@ def truth(setup: Setup) -> Truth:
     renderer = Renderer(ideal_camera(camera).world, variant, scene.render.sampler, world=rendered_world(setup))
     renderer.set_target(setup.world.image)
     mean, variance = renderer.mean_of_passes("truth", scene.render.seed, work)
-    seed = sampler_seeds(scene.render.seed, "truth", work.passes, work.passes + 1)
-    points = renderer.depths(ideal_camera(camera, FINER), seed(0))
-    depth = np.median(points.reshape(camera.rows, FINER, camera.columns, FINER), axis=(1, 3))
+    depth = _depth(renderer.staged, camera)
     return Truth(
         image=mean.reshape(camera.shape),
         variance=variance.reshape(camera.shape),
         depth=np.where(np.isfinite(depth), depth, np.nan),
         samples=work.total,
     )
+
+
+def _depth(world: Any, camera: Camera) -> FloatArray:
+    """Return the depth, (rows, columns), that rays from the array's centre meet; infinite where they meet nothing."""
+    from .renderer.worlds.building import depths_met
+
+    down, across = (
+        (count / 2 - (np.arange(FINER * count) + 0.5) / FINER) * camera.target_pitch for count in camera.shape
+    )
+    y, x = np.meshgrid(down, across, indexing="ij")
+    directions = np.stack([x.ravel(), y.ravel(), np.full(x.size, camera.distance)], axis=1)
+    points = depths_met(world.scene, world.placement, np.zeros_like(directions), directions)
+    return np.asarray(np.median(points.reshape(camera.rows, FINER, camera.columns, FINER), axis=(1, 3)))
 
 
 def truth_from(setup: Setup) -> str:

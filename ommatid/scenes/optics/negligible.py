@@ -236,8 +236,8 @@ def _illumination_change(camera: Camera, lens_type: LensType) -> float:
 
 
 def skipped_effects(scene: Scene, camera: Camera) -> tuple[SkippedEffect, ...]:
-    """Return the effects skipped in rendering, recording, calibration and reconstruction, from the scene alone."""
-    return (*_in_rendering(scene, camera), *_in_recording(scene, camera), *_in_estimation(scene))
+    """Return the effects skipped in rendering and recording, from the scene alone."""
+    return (*_in_rendering(scene, camera), *_in_recording(scene, camera))
 
 
 def assumptions(scene: Scene, camera: Camera) -> tuple[str, ...]:
@@ -312,7 +312,7 @@ def _without_waves(camera: Camera) -> SkippedEffect:
 def _in_recording(scene: Scene, camera: Camera) -> list[SkippedEffect]:
     if scene.sensor is not None:
         shot = negligible_shot_noise(scene, camera)
-        return [] if shot is None else [shot, SkippedEffect("second estimate for the shot noise", shot.why)]
+        return [] if shot is None else [shot]
     if scene.noise is None:
         return [SkippedEffect("sensor noise and quantisation", "the scene has no [noise] and no [sensor]")]
     skipped: list[SkippedEffect] = []
@@ -320,17 +320,4 @@ def _in_recording(scene: Scene, camera: Camera) -> list[SkippedEffect]:
         skipped.append(SkippedEffect("sensor noise", "noise.variance is 0"))
     if scene.noise.bits is None:
         skipped.append(SkippedEffect("quantisation", "the scene has no noise.bits"))
-    return skipped
-
-
-def _in_estimation(scene: Scene) -> list[SkippedEffect]:
-    skipped: list[SkippedEffect] = []
-    if scene.prior.kind == "independent":
-        skipped.append(SkippedEffect("covariances between pixels of the prior", "prior.kind is 'independent'"))
-    if scene.calibration.method == "ideal":
-        skipped.append(SkippedEffect("point sources", "calibration.method is 'ideal': H has a closed form"))
-        skipped.append(SkippedEffect("second estimate for the uncertainty of H", "the ideal H has none"))
-    elif scene.prior.kind != "fit" and scene.estimator.noise_variance not in (None, "fit"):
-        why = "estimator.noise_variance fixes the expected noise"
-        skipped.append(SkippedEffect("second estimate for the uncertainty of H", why))
     return skipped

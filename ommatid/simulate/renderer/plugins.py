@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.runtime.arrays import Float32Array, FloatArray
+from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import write_whole
 from ommatid.scenes.camera import Camera
@@ -114,21 +114,6 @@ def texture_of(source: dict[str, Any]) -> dict[str, Any]:
         "to_uv": upright,
         **source,
     }
-
-
-def depths(scene: Any, pinhole: Camera, seed: int, far: float, placement: Placement) -> FloatArray:
-    """Return the distance along z, mm, that a pinhole camera's only sub-imager sees at a point per pixel, (pixels,).
-
-    Infinite where it sees no surface. Transparent surfaces count like any other.
-    far : of the far clipping plane, in distances of the target;  placement : of the camera in the scene
-    """
-    (sub,) = pinhole.sub_imagers
-    sensor = mi.load_dict(stock_sensor(pinhole, sub, "independent", 1, far=far, placement=placement))
-    channels = mi.load_dict({"type": "aov", "aovs": "place:position,far:depth", "block_size": BLOCK})
-    choices: Any = {"sensor": sensor, "integrator": channels, "spp": 1, "seed": seed}
-    rendered: Any = mi.render(scene, **choices)
-    place, along = np.split(np.array(rendered, dtype=np.float64)[..., -4:].reshape(-1, 4), [3], axis=1)
-    return np.where(along[:, 0] > 0, placement.to_camera(place)[:, 2], np.inf)
 
 
 def export(setup: Setup, path: Path) -> Path:

@@ -33,7 +33,7 @@ from ..sampling.samplers import fitting
 from .averages import Averages
 from .draws import SobolDraws
 from .loaded import dr, mi
-from .plugins import black, depths, scene_of, stock_sensors, target_of, twice_if_single
+from .plugins import black, scene_of, stock_sensors, target_of, twice_if_single
 from .rays import Pixels, RayGenerator, Rays, Seed
 from .variant import activate, check_fast_variant, ignored_samples
 from .worlds.placement import MILLIMETRES_AT_ORIGIN
@@ -256,10 +256,6 @@ class Renderer:
         if lens_type.name not in self._averages:
             self._averages[lens_type.name] = Averages(self.camera, lens_type, self._picture * self._unit)
         return self._averages[lens_type.name]
-
-    def depths(self, pinhole: Camera, seed: int) -> FloatArray:
-        """Return the distance along z of what a pinhole camera's only sub-imager sees; see `plugins.depths`."""
-        return depths(self._scene, pinhole, seed, FAR, self._placement)
 
     def hits(self, pixels: Pixels, samples: int, seed: Seed) -> tuple[IntArray, FloatArray | None]:
         """Return the pixel of f that each ray of some pixels meets, (pixels, samples), -1 off the target; and weights.

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
+from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.streams import sampler_seeds
@@ -199,15 +199,23 @@ class AdaptiveRounds:
         chosen, points = self._renderer.sub_imagers([index], pixels), self._points(index, sub)
         tally = Tally.of(self._renderer.expose(chosen, work.samples, seeds, points)[0])
         floor = self._floor(index, tally.mean, work.samples)
-        self.mean[start + pixels] = tally.mean
-        if points in ("averages", "grid"):
-            self.variance[start + pixels] = np.maximum(tally.variance, floor)
-            sub.add_round(work, np.zeros(pixels.size))
-            still = self._plan_after_exact(sub, index, (tally.variance > floor) & (points == "grid"))
+        exact, variance = points in ("averages", "grid"), tally.variance
+        stated = variance if exact else posterior_variances(variance, work.passes)
+        self.mean[start + pixels], self.variance[start + pixels] = tally.mean, np.maximum(stated, floor)
+        sub.add_round(work, np.zeros(pixels.size) if exact else variance)
+        if exact:
+            still = (variance > floor) & (points == "grid")
+        else:  # False for NaN: pixels that receive no light
+            still = self.variance[start + pixels] > DONE * self._target(index, pixels)
+        if not still.all() and not sub.fewest:
+            sub.fewest = sub.spent
+        if not still.any():
+            self._end(sub, index, FLOAT32)
+        elif exact:
+            sub.next = self._first(index)
+            sub.left = float(sub.next.total * still.sum())
         else:
-            self.variance[start + pixels] = np.maximum(posterior_variances(tally.variance, work.passes), floor)
-            sub.add_round(work, tally.variance)
-            still = self._plan_next(sub, index, pixels)
+            self._plan_next(sub, index, pixels[still])
         # An interruption before this leaves a state from which the round is repeated.
         self._open[start + pixels], self.sub_imagers[index] = still, sub
 
@@ -218,16 +226,6 @@ class AdaptiveRounds:
             return "averages" if exact == AVERAGED else "grid"
         return "sobol" if self._sobol[index] else "sampler"
 
-    def _plan_after_exact(self, sub: SubImagerProgress, index: int, still: BoolArray) -> BoolArray:
-        """Plan the first round with errors of pixels whose exact passes do not agree, or end the sub-imager."""
-        sub.fewest = 0 if still.all() else sub.spent
-        if still.any():
-            sub.next = self._first(index)
-            sub.left = float(sub.next.total * still.sum())
-        else:
-            self._end(sub, index, FLOAT32)
-        return still
-
     def _affordable(self, index: int, samples: float) -> Plan:
         """Return the next round's plan, or one of about `samples` per pixel if that is less."""
         wanted = self.sub_imagers[index].next
@@ -236,29 +234,24 @@ class AdaptiveRounds:
         less = self._grid(index, max(int(samples), 1), wanted.samples)
         return less if less.total < wanted.total else wanted
 
-    def _plan_next(self, sub: SubImagerProgress, index: int, pixels: IntArray) -> BoolArray:
-        """Plan the next round of a sub-imager, and return True for those of the rendered pixels that are not done."""
+    def _target(self, index: int, pixels: IntArray) -> FloatArray:
+        """Return the allowed variance of some pixels; no number of samples gets below the rounding."""
         rows = self._slices[index]
-        mean, variance = self.mean[rows][pixels], self.variance[rows][pixels]
-        # No number of samples gets below the rounding.
-        floor = self._floor(index, mean, self._grid(index, LEAST).samples)
-        target = np.maximum(self._allowed(self.mean[rows], rows)[pixels], floor / AIM)
-        still = variance > DONE * target  # False for NaN: pixels that receive no light
-        if not still.all() and not sub.fewest:
-            sub.fewest = sub.spent
-        if not still.any():
-            self._end(sub, index, FLOAT32)
-            return still
-        values, variance, target = mean[still], variance[still], target[still]
+        floor = self._floor(index, self.mean[rows][pixels], self._grid(index, LEAST).samples)
+        return np.maximum(self._allowed(self.mean[rows], rows)[pixels], floor / AIM)
+
+    def _plan_next(self, sub: SubImagerProgress, index: int, pixels: IntArray) -> None:
+        """Plan the next round of a sub-imager, of the pixels that are not done, or end it."""
+        rows, target = self._slices[index], AIM * self._target(index, pixels)
+        values, variance = self.mean[rows][pixels], self.variance[rows][pixels]
         sub.scatter = mean_of_known(variance) * sub.last.passes
-        most = MOST_EXACT if self._renderer.is_fast else min(samples_within(values, AIM * target), MOST_SAMPLES)
-        factors = np.quantile(variance / (AIM * target), QUANTILES)
+        most = MOST_EXACT if self._renderer.is_fast else min(samples_within(values, target), MOST_SAMPLES)
+        factors = np.quantile(variance / target, QUANTILES)
         totals = [sub.law.samples(float(factor), sub.last, most) for factor in factors]
         sub.left = float(np.mean(totals)) * values.size
         sub.next = self._grid(index, min(totals[-1], LEAP * sub.last.total, MOST), most)
         if sub.next.total < LEAPS[0] * sub.last.total or sub.seeds + sub.next.passes > MOST_PASSES:
             self._end(sub, index, SAMPLES)
-        return still
 
     def _floor(self, index: int, values: FloatArray, samples: int) -> FloatArray:
         """Return the variance that no number of samples goes below: float32's rounding, and tables of point spreads."""

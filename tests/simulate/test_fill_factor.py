@@ -32,6 +32,7 @@ SHAPE = (25, 25)
 LENS: Lenses = (("1/3", [2, 2], [6, 6]),)
 FINE: Lenses = (("1", [2, 2], [18, 18]),)
 ROOM = {"lens_pitch": "1 mm"}
+BLUR = {"pixel_blur": "2 um"}  # of pixels of 6 um
 OPTICS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "pinholes": ({}, {}),
     "rotated": ({}, {"tolerance": {"rotation": "2 deg", "position": "2 um"}}),
@@ -51,10 +52,10 @@ def divided(name: str) -> Camera:
     return camera
 
 
-def opened(name: str, part: Part, light: str = "lost") -> tuple[Scene, Camera]:
+def opened(name: str, part: Part, light: str = "lost", **more: Any) -> tuple[Scene, Camera]:
     """A camera whose pixels are open in part."""
     lens, table = OPTICS[name]
-    return with_optics(lens, ROOM | table | {"fill_factor": part, "fill_light": light}, LENS, SHAPE)
+    return with_optics(lens, ROOM | table | {"fill_factor": part, "fill_light": light} | more, LENS, SHAPE)
 
 
 @pytest.mark.parametrize("name", SLOW_SURFACES)
@@ -98,10 +99,10 @@ def test_a_box_of_any_side_is_a_mean_of_points(ratio: str, part: Part) -> None:
     np.testing.assert_allclose(np.concatenate(displaced), ideal_matrix(camera).toarray(), atol=1e-7)
 
 
-@pytest.mark.parametrize("part", ["2/3", ["1/3", "1"]])
+@pytest.mark.parametrize(("part", "blur"), [("2/3", {}), (["1/3", "1"], {}), (["1/3", "1"], BLUR)])
 @pytest.mark.parametrize("name", ["diffracting", "out of focus", SLOW_SURFACES[-1]])
-def test_kernels_are_the_entries(name: str, part: Part) -> None:
-    _, camera = opened(name, part)
+def test_kernels_are_the_entries(name: str, part: Part, blur: dict[str, Any]) -> None:
+    _, camera = opened(name, part, **blur)
     kernels = designed_kernels(camera, camera.types[0]).to_sparse().toarray()
     exact = ideal_matrix(camera).toarray()
     assert np.abs(kernels - exact).max() < 4e-3 * exact.max()
@@ -141,15 +142,22 @@ def test_slits_before_pinholes_are_rendered_without_error(part: Part) -> None:
     assert rendering.record["samples"] <= 256, "in a round or two"
 
 
-@pytest.mark.parametrize("name", ["pinholes", *(pytest.param(each, marks=SLOW) for each in ("rotated", "diffracting"))])
-def test_a_camera_is_rendered_and_calibrated_as_it_is(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "pixels"),
+    [
+        ("pinholes", {"fill_factor": "2/3"}),
+        ("pinholes", BLUR),
+        *(pytest.param(each, {"fill_factor": "2/3"}, marks=SLOW) for each in ("rotated", "diffracting")),
+    ],
+)
+def test_a_camera_is_rendered_and_calibrated_as_it_is(name: str, pixels: dict[str, Any]) -> None:
     """By few numbers, with "auto": the readings are those of the closed form, and the error is the expected one."""
     needs("llvm_ad_mono")
     lens, table = OPTICS[name]
-    variance = 1.0 if name == "diffracting" else 1e-2  # which takes fewer rays
+    variance = 1.0 if name == "diffracting" or pixels == BLUR else 1e-2  # which takes fewer rays
     auto = {"noise": {"variance": variance}, "render": {"samples": "auto"}, "prior": {"kind": "fit"}}
     calibration = {"samples": 4096, "fit": "auto"}
-    optics = ROOM | table | {"fill_factor": "2/3"}
+    optics = ROOM | table | pixels
     described, camera = with_optics(lens, optics, THREE, SHAPE, calibration=calibration, **auto)
     setup = Setup.from_scene(described)
     stack, model = render(setup), calibrate(setup)

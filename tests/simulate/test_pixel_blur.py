@@ -11,7 +11,6 @@ from scipy.special import ndtr
 
 from ommatid.analysis.summary import describe
 from ommatid.reconstruct.method_choice import choose_method
-from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
@@ -22,13 +21,10 @@ from ommatid.scenes.scene import Scene, parse
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.adaptive_render import render_until
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.ideal import designed_kernels, ideal_matrix
-from ommatid.simulate.render import render
+from ommatid.simulate.ideal import ideal_matrix
 
-from ..examples import THREE, needs, with_optics
-from .test_fill_factor import LENS, OPTICS, ROOM, SHAPE, SLOW, Part
-
-BLUR = {"pixel_blur": "2 um"}  # of pixels of 6 um
+from ..examples import needs, with_optics
+from .test_fill_factor import BLUR, LENS, OPTICS, ROOM, SHAPE, SLOW, Part
 
 
 def blurred(name: str, part: Part = "1", detail: int = 1, distance: str = "1 m", **tables: Any) -> tuple[Scene, Camera]:
@@ -113,14 +109,6 @@ def test_rays_measure_the_closed_form(name: str, part: Part, detail: int) -> Non
     assert 1 - error - neglected < scores.mean() < 1 + error + neglected
 
 
-@pytest.mark.parametrize("name", ["diffracting", pytest.param("surfaces", marks=SLOW)])
-def test_kernels_are_the_entries(name: str) -> None:
-    _, camera = blurred(name, ["1/3", "1"])
-    exact = ideal_matrix(camera).toarray()
-    kernels = designed_kernels(camera, camera.types[0]).to_sparse().toarray()
-    assert np.abs(kernels - exact).max() < 4e-3 * exact.max()
-
-
 @pytest.mark.parametrize("distance", ["1 m", "20 mm"])
 def test_readings_are_those_of_the_closed_form(distance: str) -> None:
     """Rendered until the variance is a tenth of the noise's: it is the one that is stated, or less.
@@ -135,21 +123,6 @@ def test_readings_are_those_of_the_closed_form(distance: str) -> None:
     errors = rendering.mean - ideal_matrix(camera) @ setup.image.ravel()
     assert rendering.variance.max() < 2e-3
     assert np.mean(np.square(errors) / rendering.variance) < 1.5
-
-
-def test_a_camera_is_rendered_and_calibrated_as_it_is() -> None:
-    needs("llvm_ad_mono")
-    tables = {"noise": {"variance": 1.0}, "render": {"samples": "auto"}, "prior": {"kind": "fit"}}
-    described, camera = with_optics({}, ROOM | BLUR, THREE, SHAPE, calibration={"samples": 4096}, **tables)
-    setup = Setup.from_scene(described)
-    stack, model = render(setup), calibrate(setup)
-    noise = stack.values - ideal_matrix(camera) @ setup.image.ravel()
-    assert np.square(noise).mean() == pytest.approx(1.0, rel=0.2)
-    done = restore(stack, model, setup.image.ravel())
-    assert done.verdict.level == "green"
-    assert done.result.interval is not None
-    assert done.error is not None
-    assert done.result.interval.low <= done.error.mse <= done.result.interval.high
 
 
 def test_the_contrast_at_nyquist_is_that_of_a_wave() -> None:

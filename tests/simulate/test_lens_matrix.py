@@ -16,9 +16,9 @@ from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import familywise, needs
 from .test_lenses import built
+from .test_lenses_against_ideal import scores
 
 SAMPLES = 2**14
-FEWEST = 25  # rays expected in an entry, above which the root of their number is normal
 ONE = (("1/3", [1, 2], [3, 3]),)
 # Far from the best shape, wide open and off the axis: coma, astigmatism and a few waves of spherical aberration.
 BENT = [
@@ -36,18 +36,6 @@ def setup_of(surfaces: Any, wavelength: str, **more: Any) -> Setup:
     described = built({"surfaces": surfaces, **more}, ONE, (15, 15), calibration={"samples": SAMPLES}, render=render)
     camera = described.camera.model_copy(update={"wavelength": wavelength if wavelength == "none" else 5.5e-4})
     return Setup.from_scene(described.model_copy(update={"camera": camera}))
-
-
-def scores(found: sparse.csr_array, expected: sparse.csr_array, rays: float) -> np.ndarray:
-    """Return the deviation of each entry that many rays meet, in standard errors of the root of their number.
-
-    Of numbers as small as FEWEST the root is far closer to normal (Anscombe 1948): their own largest deviation is above
-    the normal limit for 2 seeds of 14.
-    """
-    dense, known = found.toarray(), expected.toarray()
-    many = known * rays >= FEWEST
-    change = np.sqrt(dense[many] * rays + 3 / 8) - np.sqrt(known[many] * rays + 3 / 8)
-    return 2 * change / np.sqrt(1 - known[many])
 
 
 CASES = {

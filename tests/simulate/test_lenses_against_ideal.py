@@ -42,7 +42,7 @@ CLOSED = OPTICS | {
 }
 
 
-def scores(found: sparse.csr_array, expected: sparse.csr_array, rays: int) -> FloatArray:
+def scores(found: sparse.csr_array, expected: sparse.csr_array, rays: float) -> FloatArray:
     """Return the deviation of each entry in standard errors, and of each row's sum over its rare entries."""
     dense, known = found.toarray(), expected.toarray()
     rare = known * rays < FEWEST

@@ -19,7 +19,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError, shortened_repr
 from ommatid.runtime.files import cached, digest, fingerprint
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.runtime.streams import Purpose, derived_seed, sampler_seeds
+from ommatid.runtime.streams import Purpose, derived_seed
 from ommatid.runtime.versions import versions
 from ommatid.scenes import stack
 from ommatid.scenes.camera import Camera
@@ -34,7 +34,7 @@ from ommatid.scenes.tables.sensor import SensorTable
 
 from .renderer.variant import choose, release
 from .sampling.checkpoint import Checkpoint, open_checkpoint
-from .sampling.passes import OverPasses, Plan, Rendering, plan, rounding_variance
+from .sampling.passes import Plan, Rendering, plan, rounding_variance
 from .world_view import rendered_world
 
 NEIGHBOURHOOD = 5  # pixels, whose variances tell what to expect of the one in their middle
@@ -107,8 +107,7 @@ def light(
     mean, variance = renderer.mean_of_passes("data", scene.render.seed, work, progress, checkpoint)
     mean *= setup.camera.received
     variance *= np.square(setup.camera.received)
-    first_seed = sampler_seeds(scene.render.seed, "data", 0, work.passes)(0)
-    record = OverPasses(work.passes, work.samples, variant, first_seed).record()
+    record = work.record(variant, scene.render.seed, "data")
     stated = variance if work.passes == 1 else stated_variance(setup.camera, mean, variance, work)
     return Rendering(mean, variance, stated, record, renderer.direct_only)
 

@@ -23,7 +23,7 @@ from ommatid.simulate.calibration.fit.chart import SIDE, chart_of
 from ommatid.simulate.calibration.fit.fit import FittedCalibration, calibrate_by_fit
 from ommatid.simulate.calibration.responses import Responses, Subsets
 from ommatid.simulate.ideal import ideal_matrix, true_matrix
-from ommatid.simulate.sampling.passes import BATCHES, FEWEST_PASSES
+from ommatid.simulate.sampling.passes import BATCHES, FEWEST_PASSES, Plan
 
 from ..examples import THREE, camera, needs, with_optics
 
@@ -53,10 +53,8 @@ def drawn(cam: Camera, matrix: sparse.csr_array, rays: int, seed: int) -> Fitted
         at = np.repeat(np.arange(mean.shape[0]), np.diff(found.indptr)), found.indices
         batches = passes.reshape(FEWEST_PASSES // BATCHES, BATCHES, *mean.shape).mean(axis=0)
         return Responses(
-            passes=FEWEST_PASSES,
-            samples=each,
-            variant="drawn",
-            first_seed=seed,
+            work=Plan(FEWEST_PASSES, each),
+            record={},
             matrix=found,
             variance=passes[:, at[0], at[1]].var(axis=0, ddof=1) / FEWEST_PASSES,
             batches=(batches[:, at[0], at[1]] - found.data).astype(np.float32),

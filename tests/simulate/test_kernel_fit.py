@@ -17,6 +17,7 @@ from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.calibration.fit.kernel_fit import KernelFit, fit_kernels, refusal
 from ommatid.simulate.calibration.responses import Responses
 from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.sampling.passes import Plan
 from tests.examples import with_optics
 
 PASSES, RAYS = 16, 256
@@ -34,7 +35,7 @@ def drawn(matrix: sparse.csr_array, rng: np.random.Generator, rays: int = RAYS) 
     at = np.repeat(np.arange(rows), np.diff(mean.indptr)), mean.indices
     batches = passes.reshape(2, 8, rows, columns).mean(axis=0)[:, *at] - mean.data
     variance = passes[:, *at].var(axis=0, ddof=1) / PASSES
-    return Responses(PASSES, rays, "llvm_ad_mono", 0, mean, variance, batches.astype(np.float32))
+    return Responses(Plan(PASSES, rays), {}, mean, variance, batches.astype(np.float32))
 
 
 def defocused(lenses: tuple[tuple[object, object, object], ...] = ONE) -> Camera:

@@ -56,7 +56,7 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     lens = optics_of(setup.camera, setup.camera.types[0], None)
     # Rays alone leave through the whole exit disk; those that the lens blocks do not count.
     lit = float(lens.lit_share(np.zeros(1))[0]) if wavelength == "none" else 1.0
-    found = scores(traced.matrix, ideal_matrix(setup.camera), traced.passes * traced.samples * lit)
+    found = scores(traced.matrix, ideal_matrix(setup.camera), traced.work.total * lit)
     assert found.size > 300
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)

@@ -61,7 +61,7 @@ def test_traced_h_is_the_closed_form(kind: str) -> None:
     render = {"sampler": "independent", "complete": True}
     described, camera = with_optics(*CLOSED[kind], calibration={"samples": SAMPLES}, render=render)
     traced = measured(Setup(described, camera), by_points=False)
-    found = scores(traced.matrix, true_matrix(camera), traced.passes * traced.samples)
+    found = scores(traced.matrix, true_matrix(camera), traced.work.total)
     assert found.size > 5000
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)

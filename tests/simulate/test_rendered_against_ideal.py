@@ -82,8 +82,8 @@ def test_calibrated_h(variant: str, samples: int) -> None:
     assert (dense[exact > 0] > 0).all(), "every entry of the closed form is seen"
     assert dense[exact == 0].sum() < 1e-5 * dense.sum(), "no other is, except by rays rounded over an edge"
     rows = np.repeat(np.arange(setup.camera.measurements), np.diff(matrix.indptr))
-    variance = np.maximum(responses.variance, rounding_variance(matrix.data, responses.samples))
-    assert_student(matrix.data - exact[rows, matrix.indices], variance, responses.passes)
+    variance = np.maximum(responses.variance, rounding_variance(matrix.data, responses.work.samples))
+    assert_student(matrix.data - exact[rows, matrix.indices], variance, responses.work.passes)
 
 
 @pytest.mark.parametrize("variant", SLOW_SCALAR)
@@ -100,8 +100,8 @@ def test_calibrated_h_of_fractional_ratios(variant: str) -> None:
     # Slivers that less than one ray in a hundred passes hits are not normally distributed.
     thick = exact[rows, matrix.indices] > 1e-3
     difference = (matrix.data - exact[rows, matrix.indices])[thick]
-    variance = np.maximum(responses.variance, rounding_variance(matrix.data, responses.samples))[thick]
-    assert_student(difference, variance, responses.passes)
+    variance = np.maximum(responses.variance, rounding_variance(matrix.data, responses.work.samples))[thick]
+    assert_student(difference, variance, responses.work.passes)
     dense = matrix.toarray()
     assert np.abs(dense - exact)[exact <= 1e-3].sum() < 1e-4 * dense.sum()
     np.testing.assert_allclose(dense.sum(axis=1), 1, atol=1e-4)

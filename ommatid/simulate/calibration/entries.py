@@ -51,7 +51,7 @@ def rendered_model(
         )
 
     def variances(responses: Responses) -> FloatArray:
-        return entry_variances(responses, camera, 1 if float64 else responses.samples)
+        return entry_variances(responses, camera, 1 if float64 else responses.work.samples)
 
     if fits(setup):
         from .fit.fit import calibrate_by_fit
@@ -59,13 +59,13 @@ def rendered_model(
         rays = {name: work.total for name, work in (plans or same_plans(setup)).items()}
         views_alone = scene.calibration.fit == "geometry"
         fit = calibrate_by_fit(setup.simulated, measure, variances, rays, with_kernels=not views_alone)
-        record |= {"fit": fit.record, **fit.responses.record()}
+        record |= {"fit": fit.record, **fit.responses.record}
         rest = None if fit.rest is None else _received(camera, fit.rest)
         model = fitted_model(setup.resolved, camera, fit.matrix, rest, record)
     else:
         responses = measure(None)
         rows = _received(camera, MeasuredRows(responses.matrix, variances(responses), responses.batches))
-        record |= responses.record()
+        record |= responses.record
         model = Model(setup.resolved, camera, rows.matrix, rows.variance, rows.batches, record)
     seconds = perf_counter() - start
     record = model.record | {
@@ -126,7 +126,7 @@ def entry_variances(responses: Responses, camera: Camera, summed: int) -> FloatA
     shrunk = np.empty_like(responses.variance)
     for rows in camera.slices():
         stored = slice(int(starts[rows.start]), int(starts[rows.stop]))
-        shrunk[stored] = shrink_variances(responses.variance[stored], responses.passes)
+        shrunk[stored] = shrink_variances(responses.variance[stored], responses.work.passes)
     return np.maximum(shrunk, rounding_variance(responses.matrix.data, summed))
 
 

@@ -9,7 +9,7 @@ the light that travels it in reverse (Veach 1997, section 4.5).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -22,7 +22,7 @@ from ommatid.scenes.setup import Setup
 
 from ..renderer.variant import check_transport_variant, choose
 from ..sampling.checkpoint import Checkpoint
-from ..sampling.passes import BATCHES, OverPasses, Plan, Plans, plan
+from ..sampling.passes import BATCHES, Plan, Plans, plan
 
 if TYPE_CHECKING:
     from ..renderer.rays import Pixels
@@ -32,14 +32,16 @@ Subsets = dict[str, IntArray | None]  # pixels of a lens type, None: all, by its
 
 
 @dataclass(frozen=True)
-class Responses(OverPasses):
+class Responses:
     """Measured entries of H, before they become a model.
 
     matrix : means of the entries;  variance : (nnz,) of these means, from the scatter of the passes
     batches : (batches, nnz) deviations of the means of some passes from those of all
-    samples : the most, where the lens types differ
+    work : that of the most samples, where the lens types differ;  record : entries for the model's
     """
 
+    work: Plan
+    record: dict[str, Any]
     matrix: sparse.csr_array
     variance: FloatArray
     batches: Float32Array
@@ -82,13 +84,11 @@ def measured(
     starts = np.concatenate([[0], np.cumsum(counts)])
     work = max(plans.values(), key=lambda plan: plan.samples)
     return Responses(
+        work=work,
+        record=work.record(variant, seed, "calibration"),
         matrix=sparse.csr_array((data, indices, starts), shape=(counts.size, renderer.camera.unknowns)),
         variance=np.concatenate([part.variance for part in parts]),
         batches=np.concatenate([part.batches for part in parts], axis=1),
-        passes=work.passes,
-        samples=work.samples,
-        variant=variant,
-        first_seed=sampler_seeds(seed, "calibration", 0, work.passes)(0),
     )
 
 

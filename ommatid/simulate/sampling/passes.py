@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.streams import Rays, sampler_seeds
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.tables.estimation import Sampler
@@ -49,6 +50,11 @@ class Plan:
     def total(self) -> int:
         """Samples per pixel of all passes."""
         return self.passes * self.samples
+
+    def record(self, variant: str, seed: int, rays: Rays) -> dict[str, Any]:
+        """Return the entries for the record of a stack or a model, with Mitsuba's variant and its first seed."""
+        first = sampler_seeds(seed, rays, 0, self.passes)(0)
+        return {"samples": self.total, "passes": self.passes, "variant": variant, "first_seed": first}
 
 
 Plans = dict[str, Plan]  # by the name of a lens type
@@ -114,25 +120,6 @@ def cells_of(lens_type: LensType) -> int:
     """Return the number of equal parts that edges of pixels of f can cut both sides of a pixel's footprint into."""
     cells = lcm(*(side.numerator for side in lens_type.footprint))
     return cells if cells <= MOST_CELLS else 1
-
-
-@dataclass(frozen=True)
-class OverPasses:
-    """Parameters of a mean over passes: passes, samples per pixel in each, Mitsuba's variant, first sampler seed."""
-
-    passes: int
-    samples: int
-    variant: str
-    first_seed: int
-
-    def record(self) -> dict[str, int | str]:
-        """Return the entries for the record of a stack or a model; samples are those of all passes."""
-        return {
-            "samples": self.passes * self.samples,
-            "passes": self.passes,
-            "variant": self.variant,
-            "first_seed": self.first_seed,
-        }
 
 
 @dataclass(frozen=True)

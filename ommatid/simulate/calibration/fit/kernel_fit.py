@@ -193,7 +193,7 @@ def chart_of(responses: Responses, designed: KernelFootprints, pixels: IntArray 
     beside = inside < LEAST_INSIDE
     for each in (values, expected, inside, *batches):
         each[beside] = 0.0
-    rays, light = responses.passes * responses.samples, values.sum(axis=0)
+    rays, light = responses.work.total, values.sum(axis=0)
     return Chart(designed, core, pixels, values - expected, inside, batches, light, rays)
 
 

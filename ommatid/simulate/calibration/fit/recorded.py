@@ -15,6 +15,7 @@ from ommatid.runtime.streams import Purpose, probe
 from ommatid.scenes.hardware.point_sources import UNKNOWN_VARIANCE
 from ommatid.scenes.model import Model, fitted_model, measured_rows
 
+from ...sampling.passes import Plan
 from ..responses import Responses
 from .fit import calibrate_by_fit, is_sharp
 
@@ -62,4 +63,4 @@ def _responses(model: Model) -> Responses:
     received = model.camera.received[rows][kept]
     measured = sparse.csr_array((matrix.data[kept] / received, matrix.indices[kept], starts), shape=matrix.shape)
     batches = (errors[:, kept] / received).astype(np.float32)
-    return Responses(DRAWS, 1, "", 0, measured, model.variance[kept] / np.square(received), batches)
+    return Responses(Plan(DRAWS, 1), {}, measured, model.variance[kept] / np.square(received), batches)

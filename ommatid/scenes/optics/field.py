@@ -257,25 +257,11 @@ def _lit(wave: Wavefront | None, height: float) -> Wavefront:
     return wave
 
 
-@dataclass(frozen=True, eq=False)
-class SamplingTables:
-    """Densities of the slopes by which diffraction and aberrations turn rays from the mean one.
+def sampling_tables(field: Optics, vergences: FloatArray, cells: int, reach: float) -> tuple[FloatArray, float, float]:
+    """Return the densities of the slopes by which diffraction and aberrations turn rays from the mean one.
 
-    heights : of the sensor point, (h,);  vergences : 1 / distance of the target, rising, (v,)
-    densities : (h, v, n, n), rows along the direction of the sensor point;  width : of the slopes of all n points
-    captured : share of the light within that width
-    """
-
-    heights: FloatArray
-    vergences: FloatArray
-    densities: FloatArray
-    width: float
-    captured: float
-
-
-def sampling_tables(field: Optics, vergences: FloatArray, cells: int, reach: float) -> SamplingTables:
-    """Return the densities of slopes of a lens for targets at vergences, which rise.
-
+    (h, v, n, n) by heights of `field.nodes` and vergences of the target, 1 / distance, which rise, with rows along the
+    direction of the sensor point; the width of the slopes of all n points; and the share of the light within it.
     Offsets drawn from densities that are linear between the points are a convolution with a tent of two cells. It damps
     a frequency f along an axis by sinc(f cell)^2, which is divided out here, as the frequencies are limited.
     cells : of the grid per wavelength times f-number;  reach : of the grid beyond the spot, in the same unit
@@ -296,7 +282,7 @@ def sampling_tables(field: Optics, vergences: FloatArray, cells: int, reach: flo
         captured.append(spread.inside)
     shape = (heights.size, vergences.size, *tables[0].shape)
     densities = np.stack(tables).reshape(shape).astype(np.float64)
-    return SamplingTables(heights, vergences, densities, cell * (shape[-1] - 1), float(np.mean(captured)))
+    return densities, cell * (shape[-1] - 1), float(np.mean(captured))
 
 
 def check_waves(lens_type: LensType, field: Optics) -> None:

@@ -140,9 +140,8 @@ class _Band:
         self._light = _table(field.lit_share(heights))
         waves = field.waves_of(ends[1] - ends[0])
         vergences = np.linspace(ends[0], ends[1], ceil(waves / STEP) + 1) if waves > SAME else np.array([sum(ends) / 2])
-        tables = sampling_tables(field, vergences, cells, beyond)
-        self.captured, self._width, self._varies = tables.captured, tables.width, vergences.size > 1
-        densities = tables.densities.astype(np.float32)
+        densities, self._width, self.captured = sampling_tables(field, vergences, cells, beyond)
+        densities, self._varies = densities.astype(np.float32), vergences.size > 1
         nodes = [field.nodes[0].tolist()]
         self._slopes: Any = (
             mi.MarginalContinuous2D2(densities, [*nodes, vergences.tolist()])

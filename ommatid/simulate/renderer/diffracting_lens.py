@@ -11,7 +11,6 @@ either is not exact.)
 # pyright: basic
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil, log, pi
 from typing import Any
@@ -24,7 +23,7 @@ from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.diffraction import QUANTILES, pattern
 from ommatid.scenes.optics.field import reach
 
-from .lens import Distance, Emission, LensModel, Point, falloff, through_thin_lens
+from .lens import Distance, Emission, LensModel, Point, drawn_bands, falloff, through_thin_lens
 from .loaded import dr, mi
 
 FEW_QUANTILES = 2**12  # where the defocus varies
@@ -34,6 +33,8 @@ SAME = 1e-3  # waves by which defocus may vary without a table of several
 BEYOND = 1 - 1e-5  # focus over distance beyond the focus: below 1, since a side that rounding decides is no random one
 TINY = 1e-6  # share of the light that lands within a million times the largest radius
 NEAR = 10.0  # apertures: surfaces that are nearer get the pattern of that distance
+# Share of the light nearer to the chief ray, cosine and sine of the direction about it, and the pupil's slant along it.
+Beam = tuple[Any, Any, Any, Any]
 
 
 class DiffractingLens(LensModel):
@@ -48,8 +49,7 @@ class DiffractingLens(LensModel):
         self._camera, self._type, self._aperture = camera, lens_type, aperture
         self._depth, self._focus = camera.depth(lens_type), camera.focus(lens_type)
         self._weight = (aperture / (2 * self._depth)) ** 2
-        self._bands = [(wavelength, share) for wavelength, share in camera.wavelengths]
-        self._limits = mi.Float(np.cumsum([share for _, share in self._bands])[:-1].astype(np.float32))
+        self._wavelengths, self._shares = zip(*camera.wavelengths, strict=True)
         _, least, largest = reach(camera, lens_type)
         self._tabulate([1 / camera.distance_of(lens_type) + 1 / depth - 1 / self._depth for depth in (least, largest)])
 
@@ -67,66 +67,47 @@ class DiffractingLens(LensModel):
     def _tabulate(self, vergences: list[float]) -> None:
         """Tabulate the patterns of all bands between vergences of the light that meets the sensor."""
         ends = np.array(
-            [[self._waves(vergence, wavelength) for vergence in vergences] for wavelength, _ in self._bands]
+            [[self._waves(vergence, wavelength) for vergence in vergences] for wavelength in self._wavelengths]
         )
         self._steps = QUANTILES if np.ptp(ends, axis=1).max() < SAME else FEW_QUANTILES
         self._tables = [BandTable(wavelengths, self._weight, self._steps) for wavelengths in ends]
-        shares = [share for _, share in self._bands]
-        self.captured = float(np.average([table.captured for table in self._tables], weights=shares))
+        self.captured = float(np.average([table.captured for table in self._tables], weights=self._shares))
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
         sample = sampler.next_2d()
-        band, share, light = self._band(sampler), sample.x, falloff(x, y, 0.0, 0.0, depth)
+        bands, share, light = drawn_bands(self._shares, sampler), sample.x, falloff(x, y, 0.0, 0.0, depth)
         if self.spreads and self.captured < 1:  # the light beyond a ring falls as 1 / radius: as many rays to each
             beyond = dr.exp(sample.x * log(1 - self.captured))
             share, light = (1 - beyond) / self.captured, light * beyond
         sine, cosine = dr.sincos(2 * pi * sample.y)
         chief = self.chief(x, y, depth)
-        beam = Beam(share, cosine, sine, 2 * (x * cosine + y * sine) * (self._aperture / 2) / (depth * depth))
+        beam = share, cosine, sine, 2 * (x * cosine + y * sine) * (self._aperture / 2) / (depth * depth)
         shift = 1 / depth - 1 / self._depth
         if self.distance is None:
-            slopes, slant = self._displaced(chief, 1 / self._camera.distance_of(self._type) + shift, beam, band)
+            slopes, slant = self._displaced(chief, 1 / self._camera.distance_of(self._type) + shift, beam, bands)
             return (0, 0, 0), (*slopes, 1), light * slant
-        rim = dr.sqrt(beam.share / (1 + self._weight * (1 - beam.share))) * self._aperture / 2
+        rim = dr.sqrt(share / (1 + self._weight * (1 - share))) * self._aperture / 2
         start = rim * cosine, rim * sine
         focal = 1 / (1 / self._depth + 1 / self._focus)
         direction = [through_thin_lens(c, a, depth, focal) for c, a in zip(chief, start, strict=True)]
         vergence = 1 / self.distance((lens[0] + start[0], lens[1] + start[1], 0), (*direction, 1))
-        slopes, slant = self._displaced(chief, vergence + shift, beam, band)
+        slopes, slant = self._displaced(chief, vergence + shift, beam, bands)
         direction = [slope - a * vergence for slope, a in zip(slopes, start, strict=True)]
         return (*start, 0), (*direction, 1), light * slant
 
-    def _band(self, sampler: Any) -> list[Any]:
-        """Draw the band of each ray: a mask for each band."""
-        if len(self._bands) == 1:
-            return [True]
-        drawn, index = sampler.next_1d(), mi.UInt32(0)
-        for number in range(len(self._bands) - 1):
-            index += dr.select(drawn >= dr.gather(mi.Float, self._limits, number), mi.UInt32(1), mi.UInt32(0))
-        return [index == number for number in range(len(self._bands))]
-
-    def _displaced(self, chief: Point, vergence: Any, beam: Beam, band: list[Any]) -> tuple[Point, Any]:
+    def _displaced(self, chief: Point, vergence: Any, beam: Beam, bands: list[Any]) -> tuple[Point, Any]:
         """Return the slopes, from the lens's centre, to the points that rays meet, and their relative weights."""
+        share, cosine, sine, slope = beam
         along: Any = 0.0
         slant: Any = 1.0
-        for (wavelength, _), table, mask in zip(self._bands, self._tables, band, strict=True):
+        for wavelength, table, later in zip(self._wavelengths, self._tables, bands, strict=True):
             waves = dr.abs(self._waves(vergence, wavelength))
-            v, relative = table.at(waves, beam.share, all_light=self.distance is not None)
-            along = dr.select(mask, v * (wavelength / (pi * self._aperture)), along)
-            slant = dr.select(mask, 1 + beam.slant * relative, slant)
+            v, relative = table.at(waves, share, all_light=self.distance is not None)
+            along = dr.select(later, v * (wavelength / (pi * self._aperture)), along)
+            slant = dr.select(later, 1 + slope * relative, slant)
         along = dr.select(vergence * self._focus < BEYOND, -along, along)
-        return (chief[0] + along * beam.cosine, chief[1] + along * beam.sine), slant
-
-
-@dataclass(frozen=True)
-class Beam:
-    """Shares of the light nearer to the chief rays, directions about them, and the pupil's slant along these."""
-
-    share: Any
-    cosine: Any
-    sine: Any
-    slant: Any
+        return (chief[0] + along * cosine, chief[1] + along * sine), slant
 
 
 class BandTable:

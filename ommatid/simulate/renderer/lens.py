@@ -11,7 +11,8 @@ the smallest x and y.
 # pyright: basic
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import Any
 
 from ommatid.scenes.camera import Camera
@@ -46,6 +47,14 @@ def falloff(x: Any, y: Any, lens_x: Any, lens_y: Any, depth: Any) -> Any:
     """
     square = ((x - lens_x) * (x - lens_x) + (y - lens_y) * (y - lens_y)) / (depth * depth)
     return 1 / ((1 + square) * (1 + square))
+
+
+def drawn_bands(shares: Sequence[float], sampler: Any) -> list[Any]:
+    """Draw the wavelength of each ray by its share of the light: for each, True for rays of it or of a later one."""
+    if len(shares) == 1:
+        return [True]
+    drawn = sampler.next_1d()
+    return [True, *(drawn >= limit for limit in accumulate(shares[:-1]))]
 
 
 class LensModel:

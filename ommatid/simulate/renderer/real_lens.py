@@ -29,7 +29,7 @@ from ommatid.scenes.optics.field import (
 from ommatid.scenes.optics.ray_trace import Functions, path, trace
 from ommatid.scenes.optics.wavefront import GRID_REACH
 
-from .lens import Distance, Emission, LensModel, Point
+from .lens import Distance, Emission, LensModel, Point, drawn_bands
 from .loaded import dr, mi
 
 HEIGHTS = 257  # off the axis, between which the middle and the amount of the light are interpolated linearly
@@ -95,20 +95,17 @@ class WaveLens(RealLens):
 
     def emit(self, x: Any, y: Any, depth: Any, sampler: Any, lens: Point) -> Emission:
         """Return origins and directions, from the lens's centre, of rays from (x, y, -depth), and weights."""
-        sample = sampler.next_2d()
-        band = self._bands[0] if len(self._bands) == 1 else None
-        drawn, vergence, ray = 0.0 if band else sampler.next_1d(), self._vergence, None
+        sample, bands = sampler.next_2d(), drawn_bands([band.share for band in self._bands], sampler)
+        vergence, ray = self._vergence, None
         if self._distance is not None:
             ray = super().emit(x, y, depth, sampler, lens)
             vergence = self._met(self._distance, ray, x, y, depth, lens)
         vergence += 1 / depth - 1 / self._depth
-        across, up, weight = self._bands[0].emit(x, y, self._depth / depth, vergence, sample, ray is not None)
-        begin = self._bands[0].share
-        for band in self._bands[1:]:
-            after, found = drawn >= begin, band.emit(x, y, self._depth / depth, vergence, sample, ray is not None)
-            values = zip(found, (across, up, weight), strict=True)
-            across, up, weight = (dr.select(after, new, old) for new, old in values)
-            begin += band.share
+        found = 0.0, 0.0, 0.0
+        for later, band in zip(bands, self._bands, strict=True):
+            of_band = band.emit(x, y, self._depth / depth, vergence, sample, ray is not None)
+            found = [dr.select(later, new, old) for new, old in zip(of_band, found, strict=True)]
+        across, up, weight = found
         if ray is None:
             return (0, 0, 0), (across, up, 1), weight
         # Nearer or further than the tables go, light is rays.

@@ -26,9 +26,8 @@ from ommatid.scenes.tables.estimation import PriorTable
 from ommatid.simulate.adaptive_render import AIM as RENDERING_AIM
 from ommatid.simulate.adaptive_render import DONE as RENDERING_DONE
 from ommatid.simulate.adaptive_render import SHARE, allowed_variance, check_noise_target
-from ommatid.simulate.calibrate import AIM, DONE, calibrate
+from ommatid.simulate.calibrate import AIM, DONE, calibrate, explains
 from ommatid.simulate.calibration import pilot
-from ommatid.simulate.calibration.entries import explains
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 from ommatid.simulate.render import exposed
 from ommatid.simulate.sampling.passes import rounding_variance

@@ -22,7 +22,6 @@ from ommatid.scenes.formats import exr
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import IN_PLACE_OF_AUTO
 from ommatid.simulate import calibrate, render
-from ommatid.simulate.calibration.entries import fits
 from ommatid.simulate.calibration.fit.fit import first_measured
 from ommatid.simulate.calibration.point_sources import RENDERINGS
 from ommatid.simulate.renderer import variant
@@ -120,7 +119,7 @@ def _calibrated_pixels(setup: Setup) -> float:
     if setup.scene.calibration.method == "ideal":
         return 0
     pixels, with_kernels = 0, setup.scene.calibration.fit != "geometry"
-    subsets = first_measured(setup.simulated, with_kernels) if fits(setup) else {}
+    subsets = first_measured(setup.simulated, with_kernels) if calibrate.fits(setup) else {}
     for lens in setup.simulated.types:
         subset = subsets.get(lens.name)
         pixels += lens.measurements if subset is None else subset.size

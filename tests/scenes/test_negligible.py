@@ -197,7 +197,6 @@ def test_a_pinhole_camera_imports_no_modules_of_lenses() -> None:
     )
     simulated = (
         "renderer.diffracting_lens",
-        "renderer.crosstalk",
         "renderer.real_lens",
         "renderer.world",
     )

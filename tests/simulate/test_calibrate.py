@@ -18,10 +18,10 @@ from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate import calibrate
-from ommatid.simulate.calibration import entries, point_sources
+from ommatid.simulate.calibration import point_sources
 from ommatid.simulate.calibration.point_sources import VisiblePixels, of_pinholes
 from ommatid.simulate.calibration.responses import measured
-from ommatid.simulate.ideal import ideal_matrix, ideal_model
+from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import scene
 
@@ -97,14 +97,14 @@ def test_a_wrong_entry_disagrees_with_the_ideal_model() -> None:
     assert found.record["agreement"]["p_value"] > 0.01
     wrong = found.matrix.copy()
     wrong.data[40] += 0.05
-    worse = entries.agreement(sparse.csr_array(wrong), found.variance, camera, 16)
+    worse = calibrate.agreement(sparse.csr_array(wrong), found.variance, camera, 16)
     assert worse["p_value"] < 1e-4
     missing = found.matrix.copy()
     missing.data[40] = 0.0
     missing.eliminate_zeros()
     kept = np.delete(found.variance, 40)
-    assert entries.agreement(sparse.csr_array(missing), kept, camera, 16)["p_value"] < 1e-4
-    dark = entries.agreement(sparse.csr_array(found.matrix.shape), np.empty(0), camera, 16)
+    assert calibrate.agreement(sparse.csr_array(missing), kept, camera, 16)["p_value"] < 1e-4
+    dark = calibrate.agreement(sparse.csr_array(found.matrix.shape), np.empty(0), camera, 16)
     assert (dark["max_z"], dark["p_value"]) == (0.0, 1.0), "no ray has hit, so nothing is known"
     assert dark["rms_difference_from_ideal"] > 0
 
@@ -128,15 +128,6 @@ def test_a_model_file_gives_the_same_model(tmp_path: Path) -> None:
     plain = sparse.load_npz(tmp_path / "model.npz")
     assert (plain != found.matrix).nnz == 0
     assert np.load(tmp_path / "model.npz")["variance"].shape == plain.data.shape
-
-
-def test_forward_and_adjoint_pass_the_dot_test() -> None:
-    described = scene(lenses=(("1/3", [3, 3], [5, 5]), ("2/5", [2, 2], "fit")))
-    one = ideal_model(described, derive(described))
-    rng = np.random.default_rng(0)
-    f, g = rng.normal(size=one.unknowns), rng.normal(size=one.measurements)
-    assert np.vdot(one.forward(f), g) == pytest.approx(np.vdot(f, one.adjoint(g)), rel=1e-12)
-    np.testing.assert_array_equal(one.forward(f.reshape(19, 19)), one.forward(f))
 
 
 def test_restrict_keeps_rows_and_their_uncertainty() -> None:

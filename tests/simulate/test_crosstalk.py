@@ -16,7 +16,7 @@ from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.pose import corner_offset
 from ommatid.scenes.scene import Scene, parse, read
 from ommatid.scenes.setup import Setup
-from ommatid.simulate.calibration.entries import rendered_model
+from ommatid.simulate.calibrate import rendered_model
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 

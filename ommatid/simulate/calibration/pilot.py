@@ -24,12 +24,11 @@ from ommatid.scenes.scene import with_tables
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.shrinkage import shrink_variances
 
-from ..calibrate import LEAST, plans_of
+from ..calibrate import LEAST, plans_of, rendered_model
 from ..render import light
 from ..renderer.variant import choose, unusable_reason
 from ..sampling.passes import BATCHES, Plan, Plans, SampleLaw, plan
 from ..sampling.samplers import fitting
-from .entries import rendered_model
 from .responses import positions_of, same_plans
 
 MOST_RAYS = 2**26  # of a pilot: some seconds

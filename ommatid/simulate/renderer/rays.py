@@ -25,7 +25,7 @@ from ommatid.scenes.tables.estimation import Sampler
 from ..sampling.passes import Plan
 from ..sampling.samplers import RELATED_DRAWS, fitting
 from .draws import GridDraws, ReseededSampler
-from .lens import Distance, LensModel, ThinLens
+from .lens import Crosstalk, Distance, LensModel, ThinLens
 from .loaded import dr, mi
 from .worlds.placement import MILLIMETRES_AT_ORIGIN, Placement
 
@@ -100,8 +100,6 @@ class RayGenerator:
         self._blur = types[0].optics.pixel_blur
         self._crossing = None
         if not camera.walls:
-            from .crosstalk import Crosstalk
-
             models = {lens_type.name: lens_of(camera, lens_type) for lens_type in camera.types}
             self._crossing = Crosstalk(camera, models)
 

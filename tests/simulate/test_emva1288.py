@@ -1,4 +1,4 @@
-"""The real sensor: what a photon-transfer curve finds is what was put in; a value's scatter is what is said of it.
+"""The real sensor: what a photon-transfer curve finds is what was put in; the ideal one: noise of a variance.
 
 The curve is written out here after EMVA Standard 1288, release 4 (linear), and sees nothing but digital numbers.
 """
@@ -24,12 +24,12 @@ from ommatid.scenes.recording import Recording, expected_recording
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.camera import ToleranceTable
-from ommatid.scenes.tables.sensor import SensorTable
+from ommatid.scenes.tables.sensor import NoiseTable, SensorTable
 from ommatid.simulate import sensors
 from ommatid.simulate.ideal import ideal_model
-from ommatid.simulate.sensors import record
+from ommatid.simulate.sensors import expose, generators, quantise, record
 
-from ..examples import THREE, Lenses, familywise, scene
+from ..examples import THREE, Lenses, camera, familywise, scene
 
 Vector = NDArray[np.float64]
 
@@ -307,3 +307,40 @@ def test_assumed_noise_variance_with_a_sensor() -> None:
     flat = restore(replace(stack, scene=stack.scene.model_copy(update={"estimator": told})), model, truth)
     assert inside(flat)
     assert flat.expected.mse >= restore(stack, model).expected.mse
+
+
+def test_noise_has_the_requested_variance() -> None:
+    rng = np.random.default_rng(0)
+    size = 40_000
+    noise = expose(np.full(size, 100.0), NoiseTable(variance=0.25), [rng], [slice(0, size)]) - 100
+    bounds = stats.chi2.ppf([0.005, 0.995], size - 1) / (size - 1)
+    assert bounds[0] < noise.var(ddof=1) / 0.25 < bounds[1]
+    assert abs(noise.mean()) < 2.6 * (0.25 / size) ** 0.5
+
+
+@pytest.mark.parametrize("bits", [4, 8, 12])
+def test_quantisation_acts_as_noise_of_a_twelfth_of_the_squared_step(bits: int) -> None:
+    values = np.random.default_rng(1).uniform(0, 255, 100_000)
+    step = 256 / 2**bits
+    error = quantise(values, NoiseTable(bits=bits).level) - values
+    assert np.abs(error).max() <= step / 2 * (1 + 1e-12)
+    # Four standard errors: the square of a uniform deviate has the relative variance 4/5.
+    assert error.var() == pytest.approx(step**2 / 12, rel=4 * (0.8 / error.size) ** 0.5)
+    assert NoiseTable(bits=bits).quantisation_variance == pytest.approx(step**2 / 12)
+    levels = np.unique(quantise(values, step) / step)
+    assert (levels == np.round(levels)).all()
+
+
+def test_no_noise_changes_nothing() -> None:
+    light = np.linspace(0, 255, 50)
+    np.testing.assert_array_equal(expose(light, NoiseTable(), [], []), light)
+
+
+def test_a_sub_imagers_noise_does_not_depend_on_its_neighbours() -> None:
+    three, one = camera(), camera(lenses=THREE[:1])
+    noise = NoiseTable(variance=1.0)
+    whole = expose(np.zeros(three.measurements), noise, generators(three, 5), three.slices())
+    alone = expose(np.zeros(one.measurements), noise, generators(one, 5), one.slices())
+    np.testing.assert_array_equal(whole[: one.measurements], alone)
+    others = expose(np.zeros(one.measurements), noise, generators(one, 6), one.slices())
+    assert abs(np.corrcoef(alone, others)[0, 1]) < 4 / 225**0.5

@@ -1,19 +1,25 @@
-"""Rendering to a stack: repeatable to the bit on any number of threads, with variances and fingerprints."""
+"""Rendering to a stack: repeatable to the bit on any number of threads, with variances and fingerprints; exports."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ommatid.scenes.camera import derive
+from ommatid.scenes.formats.exr import read_picture
 from ommatid.scenes.formats.picture import load
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
+from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import made_from, mean_of_neighbours, render
+from ommatid.simulate.renderer.plugins import export
 
 from ..examples import THREE, VARIANTS, needs, scene
 
@@ -81,3 +87,36 @@ def test_the_neighbours_of_a_pixel_do_not_hold_its_own_value() -> None:
         changed = image.copy()
         changed[place] = 100.0
         assert mean_of_neighbours(changed)[place] == pytest.approx(mean_of_neighbours(image)[place], rel=1e-12)
+
+
+MITSUBA = Path(sys.executable).with_name("mitsuba")
+
+
+def test_mitsubas_own_command_renders_the_same(tmp_path: Path) -> None:
+    """A sub-image of each lens type, films of mixed sizes, from another folder than the scene's."""
+    described = scene((19, 20), THREE[:1] + THREE[1:2] + (("1/4", [2, 2], [4, 3]),), render={"samples": 4096})
+    camera = derive(described)
+    image = load(described)
+    (tmp_path / "scene").mkdir()
+    picture = export(Setup(described, camera, image), tmp_path / "scene" / "camera.xml")
+    assert sorted(path.name for path in picture.parent.iterdir()) == ["camera.target.exr", "camera.xml"]
+    ideal = ideal_matrix(camera) @ image.ravel()
+    slices = camera.slices()
+    for number in (0, 5, 9, 30, len(slices) - 1):
+        output = tmp_path / f"{number}.exr"
+        command = [
+            str(MITSUBA),
+            "-m",
+            "scalar_rgb",
+            "-s",
+            str(number),
+            "-o",
+            str(output),
+            str(picture.parent / "camera.xml"),
+        ]
+        subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
+        rendered = read_picture(output).pixels
+        pixels = camera.sub_imagers[number].type.pixels
+        assert rendered.shape == pixels
+        # 4096 stratified samples of steps of at most 255 err by 255 / 4096^(3/4) = 0.5 at most.
+        np.testing.assert_allclose(rendered, ideal[slices[number]].reshape(pixels), atol=0.5)

@@ -1,7 +1,8 @@
-"""Mitsuba's samplers: numbers of samples that fit them, independent streams of pixels, and laws of their error."""
+"""Mitsuba's samplers and passes: numbers of samples, independent streams of pixels, running moments, laws of error."""
 
 from __future__ import annotations
 
+from math import isqrt
 from typing import Any, get_args
 
 import numpy as np
@@ -21,7 +22,7 @@ from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate
-from ommatid.simulate.sampling.passes import plan
+from ommatid.simulate.sampling.passes import BATCHES, Tally, plan, rounding_variance
 from ommatid.simulate.sampling.samplers import filling, fitting
 
 from ..examples import SLOW_SCALAR, THREE, VARIANTS, camera, familywise, needs, scene
@@ -139,3 +140,35 @@ def test_the_error_of_stratified_samples_is_that_of_the_strata(variant: str) -> 
         assert away <= corners(seen, first**2, last**2) < 0.06
     assert law("independent", seen).slope == -0.5
     assert law("ldsampler", seen).slope is None
+
+
+@given(st.integers(16, 10**6))
+def test_samples_are_divided_into_equal_passes_that_a_grid_can_fill(samples: int) -> None:
+    work = plan(samples)
+    assert work.passes >= 16
+    assert work.passes % BATCHES == 0
+    assert samples <= work.total <= 1.5 * samples + 16
+    side = isqrt(work.samples)
+    assert work.samples % side == 0, "a side of the jittered grid"
+    assert work.samples <= 4096 + 64, "float32 sums of more are wrong by over 4e-5"
+
+
+def test_tally_agrees_with_numpy_even_far_from_zero() -> None:
+    rng = np.random.default_rng(0)
+    passes = 1e6 + rng.normal(size=(20, 3, 4))
+    tally = Tally(3, 4)
+    for values in passes:
+        tally.add(values)
+    np.testing.assert_allclose(tally.mean, passes.mean(axis=0), rtol=1e-14)
+    np.testing.assert_allclose(tally.variance, passes.var(axis=0, ddof=1) / 20, rtol=1e-6)
+
+
+@pytest.mark.parametrize("samples", [16, 256, 4096])
+def test_the_rounding_variance_bounds_that_of_float32_sums(samples: int) -> None:
+    """Sums of equal float32 values one after the other, as in a film."""
+    values = np.random.default_rng(1).uniform(1, 255, 200).astype(np.float32)
+    total = np.zeros(200, np.float32)
+    for _ in range(samples):
+        total += values
+    error = total / np.float32(samples) - values.astype(np.float64)
+    assert np.sqrt(np.mean(error**2 / rounding_variance(values.astype(np.float64), samples))) < 1.5

@@ -141,9 +141,8 @@ class Renderer:
         group = next(name for name, types in self.groups.items() if lens_type in types)
         start = self.rows(group).start
         first, stop = slices[indices[0]].start - start, slices[indices[-1]].stop - start
-        if subset is None:
-            return Pixels(group, slice(first, stop), None, indices[0])
-        return Pixels(group, slice(0, subset.size), first + subset, indices[0])
+        block, numbers = (slice(first, stop), None) if subset is None else (slice(0, subset.size), first + subset)
+        return Pixels(group, block, numbers, indices[0])
 
     def blocks(self, pixels: Pixels, samples: int) -> list[Pixels]:
         """Divide pixels into blocks whose rays, `samples` a pixel, start together: one on scalar."""
@@ -296,12 +295,9 @@ class Renderer:
 
     def rows(self, group: str) -> slice:
         """Return the rows of H, or measurements, of a group's pixels."""
-        start = 0
-        for lens_type in self.camera.types:
-            if lens_type in self.groups[group]:
-                return slice(start, start + sum(member.measurements for member in self.groups[group]))
-            start += lens_type.measurements
-        raise KeyError(group)
+        types = self.groups[group]
+        slices = dict(zip(self.camera.types, self.camera.type_slices(), strict=True))
+        return slice(slices[types[0]].start, slices[types[-1]].stop)
 
 
 def _groups(camera: Camera, together: bool) -> dict[str, tuple[LensType, ...]]:

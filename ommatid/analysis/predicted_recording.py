@@ -209,16 +209,15 @@ def _calibrated(setup: Setup, camera: _Camera, stack: Stack) -> tuple[Model, Ass
     true = camera.model.matrix
     model = uncertain.around(true)
     model = replace(model, record={**model.record, "method": setup.scene.calibration.method})
-    rng = stream(setup.scene.render.seed, Purpose.PREDICTED_ERRORS)
     if setup.scene.calibration.samples != "auto":
-        return pilot.with_errors(model, rng), ()
+        return model, ()
     adds = for_stack(stack).added_error(model)
     said = (
         f"the uncertainty of H adds {100 * min(adds, AIM):.2g} %, which calibration.samples 'auto' aims at or finds",
     )
     if adds > DONE:
         model = replace(uncertain.around(true, AIM / adds), record=model.record)
-    return pilot.with_errors(model, rng), said
+    return model, said
 
 
 def _rendering_variance(

@@ -34,7 +34,6 @@ class Purpose(IntEnum):
     PREDICTION = 6  # a scene with a seed of its own
     PREDICTED_IMAGE = 7
     PREDICTED_LIGHT = 8
-    PREDICTED_ERRORS = 9  # of H
     REPEAT = 10  # of a measurement: a scene with a seed of its own
     PAPER = 11  # noise on the tiles of a photograph
     FRACTIONS = 12  # of the photograph's pixels

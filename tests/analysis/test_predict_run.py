@@ -122,6 +122,15 @@ def test_an_h_around_the_true_one_deviates_as_a_calibration_does(monkeypatch: py
     assert norms[2] == pytest.approx(norms[0], rel=0.5), "extrapolated: edges of texels do not follow a power"
 
 
+def test_a_predicted_h_has_the_errors_of_one_calibration() -> None:
+    """It deviates from the true one by its stated variances, within 3 %; by twice as much if errors are drawn again."""
+    needs("llvm_ad_mono")
+    setup = Setup.from_scene(read(TILE, (*FEW, "calibration.fit=none")))
+    model = predicted_recording(setup).model
+    away = np.square((model.matrix - ideal_matrix(setup.camera)).data).sum()
+    assert away == pytest.approx(model.variance.sum(), rel=0.15)
+
+
 def test_an_estimator_with_the_wrong_h() -> None:
     """By Eq. 5 with matrices: A of one H, light of another, with and without its scatter."""
     rng = np.random.default_rng(0)

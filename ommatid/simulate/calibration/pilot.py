@@ -195,22 +195,3 @@ def _affordable(setup: Setup, plans: Plans) -> Plans:
 
 def _rays(camera: Camera, plans: Plans) -> int:
     return sum(lens_type.measurements * plans[lens_type.name].total for lens_type in camera.types)
-
-
-def with_errors(model: Model, rng: np.random.Generator) -> Model:
-    """Return a model whose H deviates from the true one as a measured one does, by a random draw from its batches.
-
-    Rows have independent errors.
-    """
-    count = len(model.batches)
-    if count < 2:
-        return model
-    matrix = model.matrix
-    weights = rng.normal(size=(count, model.measurements))
-    rows = np.repeat(np.arange(model.measurements), np.diff(matrix.indptr))
-    errors = np.zeros(matrix.nnz)
-    for batch, weight in zip(model.batches, weights, strict=True):
-        errors += batch * weight[rows]
-    values = matrix.data + errors / (count * (count - 1)) ** 0.5
-    stored = sparse.csr_array((values, matrix.indices, matrix.indptr), shape=matrix.shape)
-    return replace(model, stored=stored)

@@ -71,24 +71,18 @@ class Pilot:
         An estimator that takes it for exact errs as one does that takes a calibrated H; noise added to the readings of
         the true H would be another error.
         """
-        model, columns = self.model, self.model.unknowns
-        old, new = positions_of(model.matrix), positions_of(matrix)
-        cells = np.sort(np.concatenate([old, new]))
-        cells = cells[np.concatenate([[True], np.diff(cells) > 0])]
-        at_old, at_new = np.searchsorted(cells, old), np.searchsorted(cells, new)
-        row, column = np.divmod(cells, columns)
-        scale = factor * self.factor[row]
-        data, variance = np.zeros(cells.size), np.zeros(cells.size)
-        data[at_old] = model.matrix.data
-        data[at_new] -= matrix.data
-        data *= np.sqrt(scale)
-        data[at_new] += matrix.data
-        variance[at_old] = model.variance
+        model, both = self.model, (self.model.matrix, matrix)
+        one, other = (sparse.csr_array((np.ones(h.nnz), h.indices, h.indptr), shape=h.shape) for h in both)
+        joined = sparse.csr_array(one + other)
+        cells = positions_of(joined)
+        at, at_true = (np.searchsorted(cells, positions_of(h)) for h in both)
+        scale = factor * self.factor[cells // model.unknowns]
+        found, true, variance = np.zeros((3, cells.size))
         batches: Float32Array = np.zeros((len(model.batches), cells.size), dtype=np.float32)
-        batches[:, at_old] = model.batches
+        found[at], variance[at], batches[:, at] = model.matrix.data, model.variance, model.batches
+        true[at_true] = matrix.data
+        joined.data = true + np.sqrt(scale) * (found - true)
         batches *= np.sqrt(scale).astype(np.float32)
-        starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=matrix.shape[0]))])
-        joined = sparse.csr_array((data, column, starts), shape=matrix.shape)
         return replace(model, stored=joined, variance=variance * scale, batches=batches)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Sequence
 from random import Random
 
 Damage = Callable[[Random, bytearray], None]
+Engine = Callable[[Random, bytes], bytes]  # returns damaged contents
 
 MAX_BLOCK = 400  # bytes that one damage affects
 INTEGER_FORMATS = "bhiq"  # of `struct`: whole numbers of 1, 2, 4 and 8 bytes, as headers hold them
@@ -90,20 +92,29 @@ def damaged_near(rng: Random, original: bytes, marks: Sequence[bytes], room: int
     """Return the bytes with a number or some bytes changed within `room` bytes after one of the marks of a header."""
     data = bytearray(original)
     for _ in range(rng.choice((1, 1, 2))):
-        starts = _ends_of(bytes(data), rng.choice(tuple(marks)))
-        if not starts:
-            continue
-        start = rng.choice(starts)
-        window = data[start : start + room]
-        rng.choice((number, number, overwrite, flip, zero))(rng, window)
-        data[start : start + room] = window
+        ends = [found.end() for found in re.finditer(b"(?s)" + re.escape(rng.choice(marks)), bytes(data))]
+        if ends:
+            start = rng.choice(ends)
+            window = data[start : start + room]
+            rng.choice((number, number, overwrite, flip, zero))(rng, window)
+            data[start : start + room] = window
     return bytes(data)
 
 
-def _ends_of(data: bytes, mark: bytes) -> list[int]:
-    ends: list[int] = []
-    start = data.find(mark)
-    while start >= 0:
-        ends.append(start + len(mark))
-        start = data.find(mark, start + 1)
-    return ends
+def marked(*marks: bytes) -> Engine:
+    """Damage near the marks of a header or anywhere."""
+    return lambda rng, original: damaged_near(rng, original, marks) if rng.random() < 0.5 else damaged(rng, original)
+
+
+def words_exchanged(separators: bytes, *extreme: str) -> Engine:
+    """Exchange one or two words between separators, a regular expression, for extreme ones, or damage any bytes."""
+
+    def exchange(rng: Random, original: bytes) -> bytes:
+        if rng.random() < 0.3:
+            return damaged(rng, original)
+        words = re.split(b"(" + separators + b")", original)
+        for _ in range(rng.choice((1, 1, 2))):
+            words[2 * rng.randrange((len(words) + 1) // 2)] = rng.choice(extreme).encode(errors="surrogatepass")
+        return b"".join(words)
+
+    return exchange

@@ -18,6 +18,7 @@ from ..modules import tracked
 SCENE = "tiny.toml"  # an undamaged scene in the folder
 BASE = "base.toml"  # the scene to which --set options apply
 RUN = "out/tiny"  # a finished run of the scene
+PARTIAL = f"{RUN}/.stack.exr.partial.npz"  # an interrupted rendering
 Originals = Callable[[Path], list[bytes]]
 
 
@@ -26,7 +27,7 @@ class FileType:
     """A type of file.
 
     file : its name in the folder;  originals : valid contents, from the files of that folder
-    damaged : returns damaged contents;  read : returns a value that is equal for equal contents
+    damaged : returns damaged contents;  read : returns what is read, with the same `fingerprint` for equal contents
     command : the command line that reads the file, if any
     sealed : True if a checksum reveals every change
     expected : the value that `read` must return for contents that an independent decoder understands, else None
@@ -82,12 +83,16 @@ class CommandFamily:
     share: float = 1.0
 
 
-def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays and other values."""
-    total = hashlib.sha256()
-    for part in parts:
-        total.update((digest(part) if isinstance(part, np.ndarray) else repr(part)).encode())
-    return total.hexdigest()
+def fingerprint(content: Any) -> str:
+    """Return a hash of an array, of another value, or of several in a list or tuple."""
+    if isinstance(content, list | tuple):
+        return hashlib.sha256("".join(map(fingerprint, content)).encode()).hexdigest()
+    return digest(content) if isinstance(content, np.ndarray) else repr(content)
+
+
+def escaped(name: str) -> str:
+    """Return a name, which need not be UTF-8, in ASCII."""
+    return name.encode("unicode_escape").decode()
 
 
 def gallery_files(pattern: str, *more: bytes) -> Originals:

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
 import numpy as np
 
 from ommatid.scenes import camera, model_file, scene, stack
-from ommatid.scenes.formats import curve, lens_file, picture
+from ommatid.scenes.formats import picture
+from ommatid.scenes.formats.curve import read_curve
+from ommatid.scenes.formats.lens_file import read_lens
 from ommatid.scenes.formats.zemax import read_catalogue
 from ommatid.scenes.hardware import frames, point_sources
 
 from ..conftest import TINY
 from . import mutations
-from .damage import damaged, damaged_near
-from .family import BASE, SCENE, FileType, Originals, fingerprint, from_folder, gallery_files
+from .damage import damaged, marked, words_exchanged
+from .family import BASE, SCENE, FileType, Originals, from_folder, gallery_files
 from .formats import encoded, exr_damaged, model_resealed, npy_damaged, npz_damaged, stack_resealed
 
 EVERYTHING = (
@@ -51,22 +52,13 @@ TIFF_MARKS = (b"II*\0", b"\0\1\3\0", b"\1\1\3\0", b"\2\1\3\0", b"\3\1\3\0", b"\x
 DOUBLET = b"# a doublet\n50.0\n29.475 3.76 1.67 25.2\n84.83 0.12 1 25.2\n0 4.2 0 17.1  # stop\n-25.87 2 1.603 14\n"
 
 
-def marked(*marks: bytes) -> Callable[[Random, bytes], bytes]:
-    """Damage near the marks of a header or anywhere."""
-
-    def damage(rng: Random, original: bytes) -> bytes:
-        return damaged_near(rng, original, marks) if rng.random() < 0.5 else damaged(rng, original)
-
-    return damage
-
-
 # Scenes and lenses
 
 
-def read_scene(path: Path, changes: tuple[str, ...] = ()) -> str:
+def read_scene(path: Path, changes: tuple[str, ...] = ()) -> object:
     described = scene.read(path, changes)
     derived = camera.derive(described)
-    return fingerprint(described.plain(), derived.describe(), derived.measurements)
+    return described.plain(), derived.describe(), derived.measurements
 
 
 def scene_mutated(rng: Random, original: bytes) -> bytes:
@@ -85,57 +77,35 @@ def settings_mutated(rng: Random, original: bytes) -> bytes:
     return json.dumps(mutations.settings(rng, mutations.keys_of(tomllib.loads(original.decode())))).encode()
 
 
-def read_with_settings(path: Path) -> str:
+def read_with_settings(path: Path) -> object:
     text = path.read_bytes()
     changes = json.loads(text) if text.startswith(b"[") and text[1:2] in (b'"', b"]") else []
     return read_scene(path.with_name(BASE), tuple(changes))
 
 
-def rows_damaged(rng: Random, original: bytes) -> bytes:
-    if rng.random() < 0.4:
-        return damaged(rng, original)
-    words = original.decode().split(" ")
-    extreme = (*mutations.NUMBERS, "x", "#", "\n", "1,5", "١", "1e9", "\x00", "\x85", "\x1b[31m", "1\n" * 20000)
-    words[rng.randrange(len(words))] = rng.choice(extreme)
-    return " ".join(words).encode()
+CONTROLS = ("x", "\x00", "\x85", "\x1b[31m", "\u202e", "1.5", "-1", "")
+rows_damaged = words_exchanged(b" ", *mutations.NUMBERS, *CONTROLS, "#", "\n", "1,5", "١", "1e9", "1\n" * 20000)
+fields_damaged = words_exchanged(b",", *mutations.NUMBERS, *CONTROLS, '"', '"x\ny"', "x" * 200000)
 
 
-def fields_damaged(rng: Random, original: bytes) -> bytes:
-    """Return a table of comma-separated fields with extreme ones."""
-    fields = original.decode("utf-8-sig").split(",")
-    extreme = (*mutations.NUMBERS, "", '"', '"x\ny"', "\x1b[31m", "x" * 200000, "-1", "1.5", "\x00", "\u202e")
-    for _ in range(rng.choice((1, 1, 2))):
-        fields[rng.randrange(len(fields))] = rng.choice(extreme)
-    return ",".join(fields).encode()
-
-
-def read_lens(path: Path) -> str:
-    return fingerprint(lens_file.read_lens(path))
-
-
-def read_glasses(path: Path) -> str:
+def read_glasses(path: Path) -> object:
     catalogue = read_catalogue(path)
     dispersions = [catalogue.dispersion(name) for name in catalogue.entries]
-    return fingerprint([(each.model_dump(mode="json"), each.index(550e-6)) for each in dispersions])
-
-
-def read_curve(path: Path) -> str:
-    return fingerprint([list(point) for point in curve.read_curve(path)])
+    return [(each.model_dump(mode="json"), each.index(550e-6)) for each in dispersions]
 
 
 # Stacks and models
 
 
-def read_stack(path: Path) -> str:
+def read_stack(path: Path) -> object:
     content = stack.read(path)
-    return fingerprint(content.values, content.variance, content.scene.plain(), content.record)
+    return content.values, content.variance, content.scene.plain(), content.record
 
 
-def read_model(path: Path) -> str:
-    model, entries = model_file.read(path), None
-    if model.stored is not None:
-        entries = [model.stored.data, model.stored.indices.astype(np.int64), model.stored.indptr.astype(np.int64)]
-    return fingerprint(*(entries or ()), model.variance, model.batches, model.scene.plain(), model.record)
+def read_model(path: Path) -> object:
+    model = model_file.read(path)
+    entries = () if model.stored is None else (model.stored.data, model.stored.indices, model.stored.indptr)
+    return *entries, model.variance, model.batches, model.scene.plain(), model.record
 
 
 # Pictures, frames and source positions
@@ -153,9 +123,9 @@ def pictures(suffix: str, *dtypes: str) -> Originals:
     return originals
 
 
-def read_picture(path: Path) -> str:
+def read_picture(path: Path) -> object:
     described = scene.read(path.with_name(SCENE), [f"target.image={path.name}", "target.origin=", "target.shape="])
-    return fingerprint(picture.load(described))
+    return picture.load(described)
 
 
 def mosaics(suffix: str) -> Originals:
@@ -170,10 +140,10 @@ def mosaics(suffix: str) -> Originals:
     return originals
 
 
-def read_mosaics(path: Path) -> str:
+def read_mosaics(path: Path) -> object:
     derived = camera.derive(scene.read(path.with_name(SCENE)))
     settings = frames.AcquisitionSettings(origin=(0, 0))
-    return fingerprint(frames.read_frames(derived, [path], settings, mosaics=True).numbers)
+    return frames.read_frames(derived, [path], settings, mosaics=True).numbers
 
 
 def positions_csv(_: Path) -> list[bytes]:
@@ -184,19 +154,9 @@ def positions_csv(_: Path) -> list[bytes]:
     return [text.encode(), b"\xef\xbb\xbfrow, column, image, note\r\n" + named.encode()]
 
 
-def read_positions(path: Path) -> str:
+def read_positions(path: Path) -> object:
     derived = camera.derive(scene.read(path.with_name(SCENE)))
-    return fingerprint(*point_sources.read_positions(path, derived, [Path(f"{index}.png") for index in range(3)]))
-
-
-def read_world(path: Path) -> str:
-    """The files that a world names; Mitsuba has to build it."""
-    from ommatid.simulate.renderer import world
-
-    described = scene.read(path.with_name(SCENE), [f"world.file={path.name}"])
-    files = world.files(described)
-    built = world.stage(described, "scalar_rgb", None)
-    return fingerprint(path.read_bytes(), len(files), len(built.scene.shapes()))
+    return point_sources.read_positions(path, derived, [Path(f"{index}.png") for index in range(3)])
 
 
 SHOW = ("show", "{file}", "--json")
@@ -247,32 +207,28 @@ LENSES_TOML, LENSES_DAT = gallery_files("lenses/*.toml"), gallery_files("lenses/
 TINY_SCENES: Originals = lambda _: [TINY.encode(), EVERYTHING.encode()]  # noqa: E731
 STACKS, MODELS = from_folder("sound.exr"), from_folder("sound.npz")
 PNG, TIFF = marked(*PNG_MARKS), marked(*TIFF_MARKS)
-FILE_TYPES = {
-    file_type.name: file_type
-    for file_type in (
-        FileType("scene, bytes", "scene.toml", SCENES, damaged, read_scene, SHOW),
-        FileType("scene, keys and values", "scene.toml", SCENES, scene_mutated, read_scene, SHOW),
-        FileType("scene, predicted", "scene.toml", TINY_SCENES, tiny_scene_mutated, read_scene, PREDICT),
-        FileType("settings", "settings.json", from_folder(BASE), settings_mutated, read_with_settings, SET),
-        FileType("lens, TOML", "lens.toml", LENSES_TOML, damaged, read_lens, LENS),
-        FileType("lens, keys and values", "lens.toml", LENSES_TOML, scene_mutated, read_lens, LENS),
-        FileType("lens, rows", "lens.dat", LENSES_DAT, rows_damaged, read_lens, LENS),
-        FileType("lens, ZMX", "lens.zmx", lambda _: [ZMX], rows_damaged, read_lens, LENS),
-        FileType("glasses, AGF", "glass.agf", lambda _: [AGF], rows_damaged, read_glasses, ()),
-        FileType("curve, CSV", "curve.csv", gallery_files("spectra/*5.csv"), damaged, read_curve, LIGHT),
-        FileType("curve, rows", "curve.csv", gallery_files("spectra/*5.csv"), rows_damaged, read_curve, LIGHT),
-        FileType("stack", "stack.exr", STACKS, exr_damaged, read_stack, STACK, sealed=True),
-        FileType("stack, resealed", "stack.exr", STACKS, stack_resealed, read_stack, STACK),
-        FileType("model", "model.npz", MODELS, npz_damaged, read_model, MODEL, sealed=True),
-        FileType("model, resealed", "model.npz", MODELS, model_resealed, read_model, MODEL),
-        FileType("picture, PNG", "p.png", pictures(".png", "u1", "u2"), PNG, read_picture, PICTURE),
-        FileType("picture, TIFF", "p.tif", pictures(".tif", "u1", "u2", "f4"), TIFF, read_picture, PICTURE),
-        FileType("picture, NPY", "p.npy", pictures(".npy", "u1", "u2", "f8"), npy_damaged, read_picture, PICTURE),
-        FileType("picture, EXR", "p.exr", pictures(".exr", "f4"), exr_damaged, read_picture, PICTURE),
-        FileType("frames, NPY", "f.npy", mosaics(".npy"), npy_damaged, read_mosaics, IMPORT),
-        FileType("frames, TIFF", "f.tif", mosaics(".tif"), TIFF, read_mosaics, IMPORT),
-        FileType("places, CSV", "places.csv", positions_csv, damaged, read_positions, ()),
-        FileType("places, rows", "places.csv", positions_csv, fields_damaged, read_positions, ()),
-        FileType("world, XML", "world.xml", gallery_files("worlds/*.xml"), damaged, read_world, ()),
-    )
-}
+FILE_TYPES = (
+    FileType("scene, bytes", "scene.toml", SCENES, damaged, read_scene, SHOW),
+    FileType("scene, keys and values", "scene.toml", SCENES, scene_mutated, read_scene, SHOW),
+    FileType("scene, predicted", "scene.toml", TINY_SCENES, tiny_scene_mutated, read_scene, PREDICT),
+    FileType("settings", "settings.json", from_folder(BASE), settings_mutated, read_with_settings, SET),
+    FileType("lens, TOML", "lens.toml", LENSES_TOML, damaged, read_lens, LENS),
+    FileType("lens, keys and values", "lens.toml", LENSES_TOML, scene_mutated, read_lens, LENS),
+    FileType("lens, rows", "lens.dat", LENSES_DAT, rows_damaged, read_lens, LENS),
+    FileType("lens, ZMX", "lens.zmx", lambda _: [ZMX], rows_damaged, read_lens, LENS),
+    FileType("glasses, AGF", "glass.agf", lambda _: [AGF], rows_damaged, read_glasses, ()),
+    FileType("curve, CSV", "curve.csv", gallery_files("spectra/*5.csv"), damaged, read_curve, LIGHT),
+    FileType("curve, rows", "curve.csv", gallery_files("spectra/*5.csv"), rows_damaged, read_curve, LIGHT),
+    FileType("stack", "stack.exr", STACKS, exr_damaged, read_stack, STACK, sealed=True),
+    FileType("stack, resealed", "stack.exr", STACKS, stack_resealed, read_stack, STACK),
+    FileType("model", "model.npz", MODELS, npz_damaged, read_model, MODEL, sealed=True),
+    FileType("model, resealed", "model.npz", MODELS, model_resealed, read_model, MODEL),
+    FileType("picture, PNG", "p.png", pictures(".png", "u1", "u2"), PNG, read_picture, PICTURE),
+    FileType("picture, TIFF", "p.tif", pictures(".tif", "u1", "u2", "f4"), TIFF, read_picture, PICTURE),
+    FileType("picture, NPY", "p.npy", pictures(".npy", "u1", "u2", "f8"), npy_damaged, read_picture, PICTURE),
+    FileType("picture, EXR", "p.exr", pictures(".exr", "f4"), exr_damaged, read_picture, PICTURE),
+    FileType("frames, NPY", "f.npy", mosaics(".npy"), npy_damaged, read_mosaics, IMPORT),
+    FileType("frames, TIFF", "f.tif", mosaics(".tif"), TIFF, read_mosaics, IMPORT),
+    FileType("places, CSV", "places.csv", positions_csv, damaged, read_positions, ()),
+    FileType("places, rows", "places.csv", positions_csv, fields_damaged, read_positions, ()),
+)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import warnings
 import zipfile
-from collections.abc import Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -35,6 +35,10 @@ SHAPES = (
 DTYPES = [
     "|O", "<f8", "<f2", "<c16", "|b1", "<i8", ">f8", "|S9", "<U5", "<M8[s]", "<f99", "V100000000", "(3,)<f4", "|O8",
 ]  # fmt: skip
+TYPES = ("f2", "f4", "f8", "g", ">f8", "c8", "c16", "i8", "U5", "?", "i1")
+PATHS = ("../x.npy", "/etc/x.npy", "x" * 60000 + ".npy", "a\\b.npy", "\x1b[31m.npy", "x")
+LARGE = 300_000_000  # bytes of zeros, deflated to a thousandth
+PICKLE = b"\x93NUMPY\1\0v\0{'descr': '|O', 'fortran_order': False, 'shape': (1,)}\ncos\nsystem\n."
 HEADERS = ("[" * 5000, "{" * 99, "(" * 90, "1" * 5000, "{'descr': " + "-" * 3000 + "1}", "", "lambda: 0")
 
 
@@ -43,14 +47,15 @@ def exr_damaged(rng: Random, original: bytes) -> bytes:
     choice = rng.random()
     if choice < 0.1:
         start = original.find(b'{"')
-        text = mutations.deep_json(rng)[: original.find(b"}", start) - start]
+        text = rng.choice(mutations.DEEP).encode()[: original.find(b"}", start) - start]
         return original[:start] + text + original[start + len(text) :]
     return damaged_near(rng, original, EXR_MARKS) if choice < 0.6 else damaged(rng, original)
 
 
 def stack_resealed(rng: Random, original: bytes) -> bytes:
     """Alter a stack and update its checksums."""
-    with _temporary_file("altered.exr") as path:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "altered.exr"
         path.write_bytes(original)
         parts = exr.read(path)
         for _ in range(rng.choice((1, 1, 2))):
@@ -77,26 +82,50 @@ def _altered_part(rng: Random, part: exr.Part) -> exr.Part:
 
 
 def npz_damaged(rng: Random, original: bytes) -> bytes:
-    """Damage an archive: its directory, its members, the header of an array, or any bytes."""
+    """Damage an archive: its directory, members, the header of an array, or any bytes; a new one if there is none."""
+    if not original:
+        stream = io.BytesIO()
+        np.savez(stream, fingerprint=np.array("x"), tried=np.array("[]"))
+        original = stream.getvalue()
     choice = rng.random()
-    if choice < 0.3:
+    if choice < 0.2:
         return damaged_near(rng, original, ZIP_MARKS, room=46)
-    if choice < 0.6:
+    if choice < 0.4:
         return damaged(rng, original)
     with zipfile.ZipFile(io.BytesIO(original)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    name, other = rng.choice(sorted(members)), rng.choice(sorted(members))
-    if choice < 0.7:
-        del members[name]
-    elif choice < 0.8:
-        members[name], members[other] = members[other], members[name]
-    else:
-        members[name] = npy_damaged(rng, members[name])
+        members = [(name, archive.read(name)) for name in archive.namelist()]
+    index, (other, exchanged) = rng.randrange(len(members)), rng.choice(members)
+    name, content = members[index]
+    changes: tuple[Callable[[], list[tuple[str, bytes]]], ...] = (
+        list,
+        lambda: [(name, exchanged), (other, content)],
+        lambda: [(name, npy_damaged(rng, content))],
+        lambda: [(name, content), (name, damaged(rng, content))],
+        lambda: [("extra.npy", PICKLE if rng.random() < 0.3 else _many_texts(rng))],
+        lambda: [(rng.choice(PATHS), content)],
+    )
+    changed = rng.choice(changes)() if rng.random() < 0.99 else [("extra.npy", npy(np.zeros(LARGE, np.uint8)))]
+    kept = [pair for pair in members if pair[0] not in {name, *(each for each, _ in changed)} or rng.random() < 0.1]
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for member, content in members.items():
-            archive.writestr(member, content)
+    with warnings.catch_warnings(), zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        warnings.simplefilter("ignore")  # of names that are there already
+        for member, data in rng.choice(([*kept, *changed], [*changed, *kept])):
+            archive.writestr(member, data)
     return stream.getvalue()
+
+
+def npy(array: Any) -> bytes:
+    """Return an array as a file."""
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def _many_texts(rng: Random) -> bytes:
+    """Return the header of very many empty texts, which take no bytes."""
+    count = rng.choice((300_000_000, 10**12, 1000))
+    header = f"{{'descr': '<U0', 'fortran_order': False, 'shape': ({count},), }}".ljust(117) + "\n"
+    return b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header.encode()
 
 
 def npy_damaged(rng: Random, original: bytes) -> bytes:
@@ -139,32 +168,40 @@ def model_resealed(rng: Random, original: bytes) -> bytes:
 
 
 def _altered_array(rng: Random, array: Any) -> Any:
-    choice = rng.randrange(7) if array.size else 3
+    """Return an array with one or some values, its order, number type or shape changed."""
     changed = array.copy()
-    if choice == 0:
-        changed.flat[rng.randrange(changed.size)] = rng.choice((-1, 0, 10**6, 2**31 - 1, 1))
-    elif choice == 1 and changed.dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            changed.flat[rng.randrange(changed.size)] = rng.choice((np.nan, np.inf, -1.0, 1e300))
-    elif choice == 2:
-        return changed.reshape(-1)[::-1].copy()
-    elif choice == 3:
-        return changed.astype(rng.choice(("f4", "f8", "i8", "c16", "U5", "?", "i1")))
-    elif choice == 4:
-        return changed[: changed.shape[0] // 2]
-    elif choice == 5:
+    at, end = (rng.randrange(max(array.size - back, 1)) for back in (1, 0))
+    choice = rng.randrange(11) if array.size else rng.randrange(6)
+    if choice < 2:
+        return changed.astype(rng.choice(TYPES))
+    if choice == 2:
+        return changed[: len(changed) // 2] if array.ndim else changed.reshape(1)
+    if choice == 3:
         return changed.reshape(*changed.shape, 1)
-    elif choice == 6:
-        return np.array(rng.choice((0, 1.5, "x")))
+    if choice < 6:
+        return np.array(rng.choice((0, 1.5, "x", [10**9, 10**9], [-1, 3], [1.5, 2], [3])))
+    numbers = (-1, 0, 10**6, 2**31 - 1, 1, *((np.nan, np.inf, -1.0, 1e300) if array.dtype.kind == "f" else ()))
+    with np.errstate(over="ignore"):
+        if choice == 6:
+            changed.flat[rng.choice((end, -1))] = rng.choice(numbers)
+        elif choice == 7:
+            changed.fill(rng.choice(numbers))
+        elif choice == 8:  # of indices: an entry twice
+            changed.flat[at : at + 2] = changed.flat[at]
+        elif choice == 9:  # of indices: entries that are out of order
+            changed.flat[at : at + 9] = changed.flat[at : at + 9][::-1]
+        else:
+            return changed.reshape(-1)[::-1].copy()
     return changed
 
 
 def encoded(suffix: str, pixels: Any) -> bytes:
     """Return a picture as a file of the format with this suffix."""
-    with _temporary_file(f"sound{suffix}") as path:
-        if suffix == ".npy":
-            np.save(path, pixels)
-        elif suffix == ".exr":
+    if suffix == ".npy":
+        return npy(pixels)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"sound{suffix}"
+        if suffix == ".exr":
             names = "RGB" if pixels.ndim == 3 else "Y"
             channels = {name: np.atleast_3d(pixels)[..., index] for index, name in enumerate(names)}
             exr.write(path, [exr.Part("one", channels, {})])
@@ -179,9 +216,3 @@ def encoded(suffix: str, pixels: Any) -> bytes:
 
             pictures.imsave(path, pixels, check_contrast=False)
         return path.read_bytes()
-
-
-@contextmanager
-def _temporary_file(name: str) -> Generator[Path]:
-    with TemporaryDirectory() as folder:
-        yield Path(folder) / name

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Callable
 from random import Random
 from typing import Any
@@ -57,6 +56,12 @@ JSON_VALUES: tuple[Any, ...] = (
     *("", "x", "x" * 5000, "1 mm", "9**9**9 m", "1/3", "points", "ideal", "\x1b[31m", "\u202e", "/dev/zero", "../x"),
     *([10**6, 10**6], [[[[[[[[1]]]]]]]], {"a": {"b": 1}}, ["I"]),
 )
+DEEP = tuple(  # JSON, closed or not
+    f"{start * depth}1{end * depth * closed}"
+    for start, end in (("[", "]"), ('{"a":', "}"), ("[[],", "]"))
+    for depth in (50, 900, 10000, 200000)
+    for closed in (0, 1)
+)
 HEADERS = ("[target]", "[camera]", "[[camera.lens]]", "[noise]", "[render]", "[a.b.c]", "[[target]]", "[camera.lens.I]")
 
 Path = tuple[str | int, ...]
@@ -84,23 +89,6 @@ def record(rng: Random, original: Any) -> Any:
     for _ in range(rng.choice((1, 1, 2))):
         _change(rng, data, lambda _: copy.deepcopy(rng.choice(JSON_VALUES)))
     return data
-
-
-def replaced(rng: Random, original: Any, value: Any) -> Any:
-    """Return a JSON document with one value exchanged for `value`."""
-    data = copy.deepcopy(original)
-    paths = _paths(data)
-    if not paths:
-        return value
-    path = rng.choice(paths)
-    _at(data, path[:-1])[path[-1]] = value
-    return data
-
-
-def deep_json(rng: Random) -> bytes:
-    """Return deeply nested JSON or a very long number."""
-    depth = rng.choice((100, 1000, 100000))
-    return rng.choice((b"[" * depth, b"[" * depth + b"]" * depth, b'{"a":' * depth, json.dumps("9" * depth).encode()))
 
 
 def settings(rng: Random, keys: list[str]) -> list[str]:

@@ -14,7 +14,11 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
+
 from ommatid.runtime.errors import InputError
+
+from .family import fingerprint
 
 REFUSED, UNCHANGED, VALID = "refused", "read unchanged", "valid, but different"
 VERDICTS = (REFUSED, UNCHANGED, VALID)
@@ -36,10 +40,10 @@ class CommandEnd:
     err: str
 
 
-def read_verdict(read: Callable[[], object], unchanged: object, expected: object = None, sealed: bool = False) -> str:
+def read_verdict(read: Callable[[], object], unchanged: str, expected: object = None, sealed: bool = False) -> str:
     """Return the verdict on what `read` returns or raises.
 
-    unchanged : value of the undamaged content;  expected : the only value that is right, None if any is
+    unchanged : fingerprint of the undamaged content;  expected : the only value that is right, None if any is
     sealed : True if a checksum reveals every change
     """
     try:
@@ -51,9 +55,9 @@ def read_verdict(read: Callable[[], object], unchanged: object, expected: object
         return unprintable(message) or REFUSED
     except BaseException as error:
         return f"{type(error).__name__}: {str(error)[:300]!r} ({_location(error)})"
-    if expected is not None and content != expected:
+    if expected is not None and expected != content:
         return "another content than an independent decoder reads"
-    if content == unchanged:
+    if fingerprint(content) == unchanged:
         return UNCHANGED
     return "a change that the checksum does not reveal" if sealed else VALID
 
@@ -165,23 +169,10 @@ def _status(key: str) -> int:
 
 def children() -> set[int]:
     """Return the processes that this one has started and that still run; those that have ended have no command line."""
-    return {
-        int(child)
-        for task in Path("/proc/self/task").iterdir()
-        for child in _children(task)
-        if (line := _command_line(int(child))) and not any(name in line for name in KEPT_PROCESSES)
-    }
-
-
-def _children(task: Path) -> list[str]:
-    try:
-        return (task / "children").read_text(encoding="ascii").split()
-    except OSError:
-        return []  # the thread has ended meanwhile
-
-
-def _command_line(process: int) -> str:
-    try:
-        return Path(f"/proc/{process}/cmdline").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return ""  # it has ended meanwhile
+    found: set[int] = set()
+    for child in psutil.Process().children():
+        with contextlib.suppress(psutil.Error):  # of those that have ended meanwhile
+            line = " ".join(child.cmdline())
+            if line and not any(name in line for name in KEPT_PROCESSES):
+                found.add(child.pid)
+    return found

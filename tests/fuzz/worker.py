@@ -17,12 +17,12 @@ from random import Random
 from time import process_time
 
 from .families import FAMILIES
-from .family import CommandFamily, FileType
+from .family import CommandFamily, FileType, fingerprint
 from .sandbox import Sandbox
 from .verdicts import REFUSED, VALID, VERDICTS, PeakMemory, children, command_verdict, read_verdict, run_command
 
 CPU_LIMIT = 10.0  # seconds of work on an input of a few kilobytes
-TIME_LIMIT = 300.0  # seconds, on a busy machine
+TIME_LIMIT = 60.0  # seconds, on a busy machine; of a process that waits for nothing
 ADDRESSES = 3 << 30  # bytes of address space beyond those at the start
 COMMAND_EVERY = 20  # one of so many contents is also given to the command line, and every valid one
 
@@ -49,10 +49,10 @@ class ContentReader:
         """Read the originals, which imports what is needed."""
         self._type, self._sandbox, self._path = file_type, sandbox, folder / file_type.file
         self._originals = file_type.originals(folder)
-        self._contents: list[object] = []
+        self._contents: list[str] = []
         for original in self._originals:
             self._path.write_bytes(original)
-            self._contents.append(file_type.read(self._path))
+            self._contents.append(fingerprint(file_type.read(self._path)))
         if file_type.command:
             run_command(self._words(""))
         sandbox.restore()
@@ -136,13 +136,13 @@ def work(inputs: list[tuple[str, int]], seed: int, folder: Path) -> None:
     warnings.simplefilter("ignore", ResourceWarning)  # decoders leave files open
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.chdir(folder)
-    sandbox = Sandbox(folder)
+    sandbox, messages = Sandbox(folder), os.dup(2)  # which stays where commands change the other
     for name, numbers in groupby(inputs, key=lambda pair: pair[0]):
         _limit_addresses(resource.RLIM_INFINITY)
         reader = opened(FAMILIES[name], sandbox, folder)
         _limit_addresses(ADDRESSES)
         for _, number in numbers:
-            print(json.dumps(asdict(_result(reader.verdict, name, seed, number))), flush=True)
+            print(json.dumps(asdict(_result(reader.verdict, name, seed, number, messages))), flush=True)
             sandbox.restore()
 
 
@@ -153,8 +153,8 @@ def opened(family: FileType | CommandFamily, sandbox: Sandbox, folder: Path) -> 
     return CommandRunner(family, sandbox, folder)
 
 
-def _result(verdict_on: Callable[[int, int], str], name: str, seed: int, number: int) -> Result:
-    faulthandler.dump_traceback_later(TIME_LIMIT, exit=True)
+def _result(verdict_on: Callable[[int, int], str], name: str, seed: int, number: int, messages: int) -> Result:
+    faulthandler.dump_traceback_later(TIME_LIMIT, exit=True, file=messages)
     signal.setitimer(signal.ITIMER_PROF, CPU_LIMIT)  # ends the process, even inside C code
     memory, start = PeakMemory(), process_time()
     verdict = verdict_on(seed, number)

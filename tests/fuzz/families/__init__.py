@@ -7,21 +7,15 @@ from math import ceil
 
 from ..family import CommandFamily, FileType
 from ..file_types import FILE_TYPES
-from .archives import ARCHIVES
 from .documents import DOCUMENTS
 from .names import NAMES
 from .options import OPTIONS
 from .pictures import PICTURES
 from .special_files import SPECIAL_FILES
-from .worlds import RENDERED, WORLDS
+from .worlds import WORLDS
 
 FAMILIES: dict[str, FileType | CommandFamily] = {
-    family.name: family
-    for family in (
-        *FILE_TYPES.values(),
-        *(*PICTURES, *ARCHIVES, *WORLDS),
-        *(*RENDERED, *DOCUMENTS, *OPTIONS, *NAMES, *SPECIAL_FILES),
-    )
+    family.name: family for family in (*FILE_TYPES, *PICTURES, *WORLDS, *DOCUMENTS, *OPTIONS, *NAMES, *SPECIAL_FILES)
 }
 
 

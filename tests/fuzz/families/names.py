@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 
-from ..family import SCENE, CommandCase, CommandFamily
+from ..family import SCENE, CommandCase, CommandFamily, escaped
 
 STEMS = (
     ".", "..", "...", " ", "  .", "-", "--help", "-o", "a b", "a\tb", "a\nb", "\r", "\x1b[31mred\x1b[0m",
@@ -16,39 +16,31 @@ STEMS = (
     "[red]", "*", "?", "con", "nul", "<script>", "\"'&", "=cmd", "@x", "run", "index", "new", "sweep", ".jobs",
     ".hidden", "a.part.b", "C:x", "a:b", "a\\b",
 )  # fmt: skip
-SCENE_COMMANDS = (
-    *(
-        ("show", "{}"),
-        ("predict", "{}", "--no-rays"),
-        ("render", "{}", "-o", "new"),
-        ("run", "{}", "-o", "new", "--dry-run"),
-    ),
-    *(("calibrate", "{}", "-o", "new.npz"), ("export", "{}", "-o", "new.xml"), ("render", "{}", SCENE, "-o", "new")),
+# The name of a file, the sound one of which it is a copy, and commands that read or write it.
+Row = tuple[str, str, tuple[tuple[str, ...], ...]]
+SCENES: tuple[Row, ...] = (
+    ("{}.toml", SCENE, (("show", "{}"), ("predict", "{}", "--no-rays"), ("render", "{}", "-o", "new"))),
+    ("{}.toml", SCENE, (("run", "{}", "-o", "new", "--dry-run"), ("render", "{}", SCENE, "-o", "new"))),
+    ("{}.toml", SCENE, (("calibrate", "{}", "-o", "new.npz"), ("export", "{}", "-o", "new.xml"))),
 )
-OUTPUT_COMMANDS = (
-    *(
-        ("render", SCENE, "-o", "{}"),
-        ("calibrate", SCENE, "-o", "{}.npz"),
-        ("export", SCENE, "-o", "{}.xml"),
-        ("init", "{}.toml"),
-    ),
-    *(
-        ("show", SCENE, "--figure", "{}.png"),
-        ("export", "sound.npz", "-o", "{}.npz"),
-        ("export", "sound.npz", "-o", "{}"),
-    ),
-    ("reconstruct", "sound.exr", "sound.npz", "-o", "{}.exr"),
+INPUTS: tuple[Row, ...] = (
+    ("{}.exr", "sound.exr", (("reconstruct", "{}", "sound.npz", "-o", "new.exr"),)),
+    ("{}.npz", "sound.npz", (("check", "sound.exr", "{}"),)),
+    ("{}.npy", "mosaic.npy", (("import", SCENE, "{}", "-o", "new.exr", "--origin", "0,0"),)),
+    ("{}.csv", "spectrum.csv", (("show", SCENE, "--set", "light.spectrum={}"),)),
+    ("{}.dat", "lenses/planoconvex.dat", (("show", SCENE, "--set", "camera.lens.I.surfaces={}"),)),
 )
-INPUTS = {
-    "{}.exr": ("sound.exr", ("reconstruct", "{}.exr", "sound.npz", "-o", "new.exr")),
-    "{}.npz": ("sound.npz", ("check", "sound.exr", "{}.npz")),
-    "{}.npy": ("mosaic.npy", ("import", SCENE, "{}.npy", "-o", "new.exr", "--origin", "0,0")),
-    "{}.csv": ("spectrum.csv", ("show", SCENE, "--set", "light.spectrum={}.csv")),
-    "{}.dat": ("lenses/planoconvex.dat", ("show", SCENE, "--set", "camera.lens.I.surfaces={}.dat")),
-}
+OUTPUTS: tuple[Row, ...] = (
+    ("{}", "", (("render", SCENE, "-o", "{}"), ("export", "sound.npz", "-o", "{}"))),
+    ("{}.npz", "", (("calibrate", SCENE, "-o", "{}"), ("export", "sound.npz", "-o", "{}"))),
+    ("{}.xml", "", (("export", SCENE, "-o", "{}"),)),
+    ("{}.toml", "", (("init", "{}"),)),
+    ("{}.png", "", (("show", SCENE, "--figure", "{}"),)),
+    ("{}.exr", "", (("reconstruct", "sound.exr", "sound.npz", "-o", "{}"),)),
+)
 
 
-def random_stem(rng: Random) -> str:
+def stem(rng: Random) -> str:
     """Return a name, or one made of characters of several."""
     if rng.random() < 0.7:
         return rng.choice(STEMS)
@@ -56,48 +48,23 @@ def random_stem(rng: Random) -> str:
     return parts.replace("/", "").replace("\0", "") or "."
 
 
-def scene_case(rng: Random, folder: Path) -> CommandCase:
-    """Return a command on a scene of such a name."""
-    name = f"{random_stem(rng)}.toml"
-    command = rng.choice(SCENE_COMMANDS)
-    _copied(folder, SCENE, name)
-    outputs = ("new",) if len(command) > 3 else ()
-    return CommandCase(_words(command, name), outputs=outputs)
+def named(kind: str, rows: tuple[Row, ...]) -> CommandFamily:
+    """Return the family of commands on a file of such a name."""
+
+    def case(rng: Random, folder: Path) -> CommandCase:
+        pattern, original, commands = rng.choice(rows)
+        start = stem(rng)
+        name = pattern.replace("{}", start)
+        if original:
+            with suppress(OSError):  # of a name that the file system does not take: the file is missing
+                shutil.copyfile(folder / original, folder / name)
+        words = [word.replace("{}", name) for word in rng.choice(commands)]
+        if words[1].startswith("-"):
+            words[1] = f"./{words[1]}"
+        outputs = ("new",) if any(word.startswith("new") for word in words) else ()
+        return CommandCase(tuple(words), outputs=outputs if original else (escaped(start),))
+
+    return CommandFamily(f"names of {kind}", case)
 
 
-def input_case(rng: Random, folder: Path) -> CommandCase:
-    """Return a command on a stack, a model, a frame, a curve or a lens of such a name."""
-    stem, pattern = random_stem(rng), rng.choice(sorted(INPUTS))
-    original, command = INPUTS[pattern]
-    _copied(folder, original, pattern.replace("{}", stem))
-    return CommandCase(_words(command, stem))
-
-
-def output_case(rng: Random, folder: Path) -> CommandCase:
-    """Return a command that writes to such a name."""
-    del folder
-    stem = random_stem(rng)
-    written = stem.encode("unicode_escape", "surrogateescape").decode()
-    names = (written, os.fsdecode(os.fsencode(stem)).encode("unicode_escape", "backslashreplace").decode())
-    return CommandCase(_words(rng.choice(OUTPUT_COMMANDS), stem), outputs=names)
-
-
-def _words(command: tuple[str, ...], name: str) -> tuple[str, ...]:
-    words = [word.replace("{}", name) for word in command]
-    if any(word.startswith("-") for word in words[1:2]):
-        words[1] = f"./{words[1]}"
-    return tuple(words)
-
-
-def _copied(folder: Path, original: str, name: str) -> None:
-    try:
-        shutil.copyfile(folder / original, folder / name)
-    except OSError:
-        return  # a name that the file system does not take: the file is missing
-
-
-NAMES = (
-    CommandFamily("names of scenes", scene_case, ()),
-    CommandFamily("names of inputs", input_case, ()),
-    CommandFamily("names of outputs", output_case, ()),
-)
+NAMES = (named("scenes", SCENES), named("inputs", INPUTS), named("outputs", OUTPUTS))

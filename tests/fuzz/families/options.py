@@ -9,7 +9,7 @@ from random import Random
 from typing import Any
 
 from .. import mutations
-from ..family import RUN, SCENE, CommandCase, CommandFamily
+from ..family import RUN, SCENE, CommandCase, CommandFamily, escaped
 
 HARMLESS: dict[str, tuple[str, ...]] = {
     "show": (SCENE,),
@@ -44,22 +44,9 @@ TEXTS = (
     "file:///etc/passwd", "http://", "tcp://localhost:99999999",
 )  # fmt: skip
 FILES = (
-    "",
-    " ",
-    ".",
-    "..",
-    "/",
-    "new/x/y",
-    "\udcff\udcfe",
-    "x" * 256,
-    "x/" * 3000,
-    "\x1b[31m",
-    "-",
-    "--",
-    "new\n",
-    SCENE,
+    "", " ", ".", "..", "/", "new/x/y", "\udcff\udcfe", "x" * 256, "x/" * 3000, "\x1b[31m", "-", "--", "new\n", SCENE,
     "out",
-)
+)  # fmt: skip
 SETS = ("", "=", "a", "a=b", "noise.variance", "noise.variance=", "camera.lens.I=1", "render.samples=1e400", "target=1")
 SWEEPS = (
     *("", "=", "a", "noise.variance=", "noise.variance=1", "noise.variance=1,", "noise.variance=1,1", "x.y=1,2"),
@@ -103,7 +90,7 @@ def option_case(rng: Random, folder: Path) -> CommandCase:
 def _outputs(words: list[str]) -> tuple[str, ...]:
     """Return the beginnings of the names of what a command may write: what follows its options that name files."""
     named = [after.strip("/") for word, after in pairwise(words) if word in ("-o", "--output", "--figure")]
-    return ("new", "out", *(name.encode("unicode_escape", "surrogateescape").decode() for name in named if name))
+    return ("new", "out", *(escaped(name) for name in named if name))
 
 
 def _kind(option: Any) -> str:
@@ -134,15 +121,10 @@ def slow_case(rng: Random, folder: Path) -> CommandCase:
     if name == "bench":
         wrong += [("--within", rng.choice(NOT_VALUES)), ("--lens", "nope"), ("--set", "a=b")] * 2
     if name == "paper":
-        wrong += [
-            ("--seed", rng.choice(("-1", "x", "1.5", "nan"))),
-            ("--image", rng.choice(("nope.png", "photo:nope", "out"))),
-        ] * 2
-    if name in ("paper", "stability", "bench"):
-        wrong += [
-            ("-o", f"{SCENE}/x"),
-            ("--format", rng.choice(("exe", "npy"))),
-        ]
+        image, seed = rng.choice(("nope.png", "photo:nope", "out")), rng.choice(("-1", "x", "1.5", "nan"))
+        wrong += [("--seed", seed), ("--image", image)] * 2
+    if name != "doctor":
+        wrong += [("-o", f"{SCENE}/x"), ("--format", rng.choice(("exe", "npy")))]
     return CommandCase((name, *SLOW[name], *rng.choice(wrong)), refused=True)
 
 

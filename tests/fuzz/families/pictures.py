@@ -5,12 +5,10 @@ The pixels that were encoded are known, so that what is read can be compared wit
 
 from __future__ import annotations
 
-import hashlib
 import io
 import struct
 import warnings
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -18,12 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from ommatid.scenes import scene
-from ommatid.scenes.formats import picture
-
 from ...scenes import picture_bytes as made
-from ..damage import damaged, damaged_near
-from ..family import SCENE, FileType
+from ..damage import Engine, marked
+from ..family import FileType
+from ..file_types import PICTURE, read_picture
 
 LUMINANCE = np.array((0.2125, 0.7154, 0.0721))  # docs/pictures.md
 CLOSE = 2e-3  # of 255: half a step of 16 bits
@@ -32,33 +28,23 @@ DEPTHS = {GREY: (1, 2, 4, 8, 16), RGB: (8, 16), PALETTE: (1, 2, 4, 8), GREY_ALPH
 PNG_MARKS = (b"IHDR", b"PLTE", b"tRNS", b"acTL", b"fcTL", b"eXIf", b"IDAT")
 ROWS, COLUMNS = 20, 24
 BOMB = 6000  # pixels along a side of a picture that is a few kilobytes large
-_expected: dict[bytes, Pixels] = {}  # by the digest of a content
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """Values of a picture, equal to others within the rounding of 16 bits; without values equal to none."""
+    """Values of a picture, equal to an array within the rounding of 16 bits; without values equal to none."""
 
     values: Any
 
     def __eq__(self, other: object) -> bool:
-        """Compare shapes and values."""
-        if not isinstance(other, Pixels) or self.values is None or other.values is None:
+        """Return True for an array of the same shape and values."""
+        if not isinstance(other, np.ndarray) or self.values is None or self.values.shape != other.shape:
             return False
-        return self.values.shape == other.values.shape and bool(np.abs(self.values - other.values).max() <= CLOSE)
+        return bool(np.abs(self.values - other).max() <= CLOSE)
 
 
 NEVER = Pixels(None)  # of contents that must be refused
-
-
-def expected(content: bytes) -> Pixels | None:
-    """Return what must be read from a content, None if that is not known."""
-    return _expected.get(hashlib.sha256(content).digest())
-
-
-def _remembered(content: bytes, pixels: Pixels) -> bytes:
-    _expected[hashlib.sha256(content).digest()] = pixels
-    return content
+known: dict[bytes, Pixels] = {}  # what must be read from a content
 
 
 def _luminance(values: Any, largest: int) -> Pixels:
@@ -69,16 +55,11 @@ def _luminance(values: Any, largest: int) -> Pixels:
 
 def oriented(values: Any, orientation: int) -> Any:
     """Return a picture as EXIF's orientation asks: (rows, columns, channels)."""
-    turns: dict[int, Callable[[Any], Any]] = {
-        2: lambda image: image[:, ::-1],
-        3: lambda image: image[::-1, ::-1],
-        4: lambda image: image[::-1],
-        5: lambda image: image.transpose(1, 0, 2),
-        6: lambda image: image.transpose(1, 0, 2)[:, ::-1],
-        7: lambda image: image[::-1, ::-1].transpose(1, 0, 2),
-        8: lambda image: image.transpose(1, 0, 2)[::-1],
-    }
-    return turns.get(orientation, lambda image: image)(values)
+    if orientation in (5, 6, 7, 8):
+        values = values.transpose(1, 0, 2)
+    if orientation in (2, 3, 6, 7):
+        values = values[:, ::-1]
+    return values[::-1] if orientation in (3, 4, 7, 8) else values
 
 
 def png(rng: Random, _: bytes) -> bytes:
@@ -91,36 +72,28 @@ def png(rng: Random, _: bytes) -> bytes:
     values = numbers.integers(0, 1 << depth, (ROWS, COLUMNS, made.SAMPLES[colour]))
     pixels, chunks = _luminance(values, (1 << depth) - 1), b""
     if colour in (GREY_ALPHA, RGBA):
-        if rng.random() < 0.5:
-            values[..., -1] = (1 << depth) - 1
-            pixels = _luminance(values[..., :-1], (1 << depth) - 1)
-        else:
-            pixels = NEVER
+        opaque = rng.random() < 0.5
+        values[..., -1] = (1 << depth) - 1 if opaque else values[..., -1]
+        pixels = _luminance(values[..., :-1], (1 << depth) - 1) if opaque else NEVER
     if colour == PALETTE:
         table = numbers.integers(0, 256, (1 << depth, 3), dtype=np.uint8)
         chunks += made.chunk(b"PLTE", table.tobytes())
         pixels = _luminance(table[values[..., 0]].astype(float), 255)
     if colour in (GREY, RGB, PALETTE) and rng.random() < 0.15:
-        transparent = values[0, 0]
-        chunks += made.chunk(
-            b"tRNS", bytes([0, 255]) * (1 << depth - 1) if colour == PALETTE else transparent.astype(">u2").tobytes()
-        )
-        pixels = NEVER
+        transparent = bytes([0, 255]) * (1 << depth - 1) if colour == PALETTE else values[0, 0].astype(">u2").tobytes()
+        chunks, pixels = chunks + made.chunk(b"tRNS", transparent), NEVER
     turned = rng.choice((0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9))
     if turned:
         chunks += made.chunk(b"eXIf", made.exif(turned, rng.choice("<>")))
-        grey = pixels.values
-        pixels = NEVER if grey is None else Pixels(oriented(grey[..., np.newaxis], turned)[..., 0])
-    frame_count = rng.choice((0, 0, 0, 0, 1, 2, 1000))
-    data = zlib.compress(made.filtered(values, depth))
-    if frame_count:
-        control = struct.pack(">IIIIIHHBB", 0, COLUMNS, ROWS, 0, 0, 1, 10, 0, 0)
-        chunks += made.chunk(b"acTL", struct.pack(">II", frame_count, 0)) + made.chunk(b"fcTL", control)
-        pixels = pixels if frame_count == 1 else NEVER
-    more = b""
-    if frame_count > 1:
-        control = struct.pack(">IIIIIHHBB", 1, COLUMNS, ROWS, 0, 0, 1, 10, 0, 0)
-        more = made.chunk(b"fcTL", control) + made.chunk(b"fdAT", struct.pack(">I", 2) + data)
+    if pixels is not NEVER:
+        pixels = Pixels(oriented(pixels.values[..., np.newaxis], turned)[..., 0])
+    frames, data, more = rng.choice((0, 0, 0, 0, 1, 2, 1000)), zlib.compress(made.filtered(values, depth)), b""
+    control = [struct.pack(">IIIIIHHBB", number, COLUMNS, ROWS, 0, 0, 1, 10, 0, 0) for number in (0, 1)]
+    if frames:
+        chunks += made.chunk(b"acTL", struct.pack(">II", frames, 0)) + made.chunk(b"fcTL", control[0])
+    if frames > 1:
+        pixels = NEVER
+        more = made.chunk(b"fcTL", control[1]) + made.chunk(b"fdAT", struct.pack(">I", 2) + data)
     header = made.header(ROWS, COLUMNS, colour, depth)
     content = made.png_of(header, chunks, made.chunk(b"IDAT", data), more)
     return _perhaps_damaged(rng, content, pixels, PNG_MARKS)
@@ -140,10 +113,10 @@ def _png_bomb(rng: Random) -> bytes:
 
 def _perhaps_damaged(rng: Random, content: bytes, pixels: Pixels, marks: tuple[bytes, ...]) -> bytes:
     """Remember what must be read of a content, or damage it."""
-    choice = rng.random()
-    if choice < 0.7:
-        return _remembered(content, pixels)
-    return damaged_near(rng, content, marks) if choice < 0.9 else damaged(rng, content)
+    if rng.random() < 0.3:
+        return marked(*marks)(rng, content)
+    known[content] = pixels
+    return content
 
 
 def jpeg(rng: Random, _: bytes) -> bytes:
@@ -155,17 +128,11 @@ def jpeg(rng: Random, _: bytes) -> bytes:
     channels = [(row * a + column * b) % 251 for a, b in ((9, 3), (2, 5), (1, 7), (4, 4))]
     image = Image.fromarray(np.stack(channels, axis=-1).astype(np.uint8), "RGBA")
     image = Image.merge("CMYK", image.split()) if mode == "CMYK" else image.convert("RGB").convert(mode)
-    turned = rng.choice((0, 1, 2, 3, 4, 5, 6, 7, 8, 9))
-    stream = io.BytesIO()
-    options: dict[str, Any] = {
-        "quality": rng.choice((30, 90)),
-        "exif": b"Exif\0\0" + made.exif(turned, rng.choice("<>")) if turned else b"",
-    }
-    several = rng.random() < 0.15
-    if several:
-        image.save(stream, "MPO", save_all=True, append_images=[image], **options)
-    else:
-        image.save(stream, "JPEG", progressive=rng.random() < 0.3, **options)
+    turned, several, stream = rng.randrange(10), rng.random() < 0.15, io.BytesIO()
+    options: dict[str, Any] = {"save_all": True, "append_images": [image]} if several else {}
+    options["exif"] = b"Exif\0\0" + made.exif(turned, rng.choice("<>")) if turned else b""
+    options |= {"quality": rng.choice((30, 90)), "progressive": rng.random() < 0.3}
+    image.save(stream, "MPO" if several else "JPEG", **options)
     content = stream.getvalue()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of files of several pictures
@@ -187,42 +154,29 @@ def tiff(rng: Random, _: bytes) -> bytes:
     turned = rng.choice((0, 0, 1, 2, 3, 4, 5, 6, 7, 8))
     photometric = "rgb" if channels == 3 else "miniswhite" if inverted else "minisblack"
     stored = values if channels == 3 else values[..., 0]
-    stream = io.BytesIO()
-    with tifffile.TiffWriter(
-        stream, bigtiff=rng.random() < 0.2, byteorder="<" if rng.random() < 0.5 else ">"
-    ) as writer:
+    stream, order = io.BytesIO(), "<" if rng.random() < 0.5 else ">"
+    extra = [(274, "H", 1, turned, True)] if turned else []
+    with tifffile.TiffWriter(stream, bigtiff=rng.random() < 0.2, byteorder=order) as writer:
         for _page in range(pages):
-            extra = [(274, "H", 1, turned, True)] if turned else []
-            options: dict[str, Any] = {
-                "compression": rng.choice((None, None, "lzw", "zlib", "packbits")),
-                "metadata": None,
-            }
-            writer.write(stored, photometric=photometric, extratags=extra, contiguous=False, **options)
+            packed: Any = rng.choice((None, None, "lzw", "zlib", "packbits"))
+            options: dict[str, Any] = {"compression": packed, "metadata": None, "extratags": extra}
+            writer.write(stored, photometric=photometric, contiguous=False, **options)
     largest = 65535 if kind == "u2" else 255
     seen = largest - values if inverted else values
     pixels = NEVER if pages > 1 else _luminance(oriented(seen, turned), largest)
     return _perhaps_damaged(rng, stream.getvalue(), pixels, (b"II*\0", b"MM\0*", b"\x12\1", b"\1\x12"))
 
 
-def read_picture(path: Path) -> Pixels:
-    """Read a target picture."""
-    described = scene.read(path.with_name(SCENE), [f"target.image={path.name}", "target.origin=", "target.shape="])
-    return Pixels(picture.load(described))
-
-
-def _one(make: Callable[[Random, bytes], bytes]) -> Callable[[Path], list[bytes]]:
-    """Return an original: the first harmless content that is made."""
+def of_kind(suffix: str, make: Engine) -> FileType:
+    """Return a type of pictures, whose original is the first harmless content that is made."""
 
     def originals(_: Path) -> list[bytes]:
         contents = (make(Random(seed), b"") for seed in range(1000))
-        return [next(content for content in contents if expected(content) not in (None, NEVER))]
+        return [next(content for content in contents if known.get(content, NEVER) is not NEVER)]
 
-    return originals
+    name = {"png": "PNG", "jpg": "JPEG", "tif": "TIFF"}[suffix]
+    kinds = f"picture, kinds of {name}", f"k.{suffix}"
+    return FileType(*kinds, originals, make, read_picture, PICTURE, expected=known.get)
 
 
-SHOW = ("show", SCENE, "--json", "--set", "target.image={file}", "--set", "target.origin=", "--set", "target.shape=")
-PICTURES = (
-    FileType("picture, kinds of PNG", "k.png", _one(png), png, read_picture, SHOW, expected=expected),
-    FileType("picture, kinds of JPEG", "k.jpg", _one(jpeg), jpeg, read_picture, SHOW, expected=expected),
-    FileType("picture, kinds of TIFF", "k.tif", _one(tiff), tiff, read_picture, SHOW, expected=expected),
-)
+PICTURES = of_kind("png", png), of_kind("jpg", jpeg), of_kind("tif", tiff)

@@ -9,8 +9,8 @@ from random import Random
 
 import numpy as np
 
-from ..damage import damaged
-from ..family import SCENE, CommandCase, CommandFamily, FileType, fingerprint
+from ..damage import Engine, damaged, words_exchanged
+from ..family import SCENE, CommandCase, CommandFamily, FileType, gallery_files
 
 HEAD = '<scene version="3.0.0">'
 LIGHT = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
@@ -30,6 +30,41 @@ PLUGINS = (
 NUMBERS = (
     "nan", "inf", "-inf", "1e400", "-1", "0", "1e308", "1e-320", "x", "", "1 2 3", "9" * 5000, "-0.0", "0x10", "1e38",
 )  # fmt: skip
+NAMES = ("", "x" * 10000, "\x85", "\u202e", "a.b", "ommatid_target", "é", "\x7f[31m", "x\ny")
+TAGS = ("shape", "emitter", "bsdf", "integrator", "sensor", "film", "texture", "medium", "volume", "x")
+# Elements by what "@" in them stands for.
+ELEMENTS: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
+    (PLUGINS, tuple(f'<{tag} type="@"/>' for tag in TAGS)),
+    (
+        OUTSIDE,
+        (
+            *('<include filename="@"/>', '<path value="@"/>'),
+            *(
+                f'<shape type="{kind}"><string name="filename" value="@"/></shape>'
+                for kind in ("ply", "obj", "serialized")
+            ),
+            '<emitter type="envmap"><string name="filename" value="@"/></emitter>',
+            '<shape type="cube"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
+            '<string name="filename" value="@"/></texture></bsdf></shape>',
+            '<shape type="cube"><bsdf type="diffuse"><spectrum name="reflectance" filename="@"/></bsdf></shape>',
+            '<default name="f" value="@"/><shape type="ply"><string name="filename" value="$f"/></shape>',
+            '<default name="t" value="@"/><shape type="$t"/>',
+        ),
+    ),
+    (
+        NUMBERS,
+        (
+            f'<shape type="sphere"><float name="radius" value="@"/>{WHERE}</shape>',
+            '<emitter type="point"><rgb name="intensity" value="@"/></emitter>',
+            '<shape type="cube"><transform name="to_world"><scale value="@"/></transform></shape>',
+            '<shape type="cube"><transform name="to_world"><translate z="@"/></transform></shape>',
+            '<integrator type="path"><integer name="max_depth" value="@"/></integrator>',
+            f'<shape type="rectangle"><emitter type="area"><rgb name="radiance" value="@"/></emitter>{WHERE}</shape>',
+        ),
+    ),
+    (NAMES, ('<shape type="cube" id="@"/>', '<ref id="@"/>', '<float name="@" value="1"/>', '<x y="@"/>')),
+)
+MANY = (BLOCK, "<ref id='x'/>", "<default name='a' value='b'/>", '<include filename="worlds/corridor.xml"/>')
 LAUGHS = (
     "<!DOCTYPE x [<!ENTITY a 'aaaaaaaaaa'>"
     + "".join(f"<!ENTITY {chr(98 + index)} '{('&' + chr(97 + index) + ';') * 10}'>" for index in range(9))
@@ -42,205 +77,88 @@ def elements(rng: Random, original: bytes) -> bytes:
     """Return a world with one hostile element, or with damaged bytes."""
     if rng.random() < 0.15:
         return damaged(rng, original)
-    inside = LIGHT + BLOCK + rng.choice(ELEMENTS)(rng)
+    inside = f"{LIGHT}{BLOCK}{_element(rng)}"
+    entities, used = rng.choices((("", ""), (LAUGHS, "&j;"), (EXTERNAL, "&e;")), (30, 1, 1))[0]
+    if used:
+        inside += f"<default name='x' value='{used}'/>"
+    encoding = rng.choices(("utf-8", "utf-16", "utf-32", "utf-8-sig"), (72, 1, 1, 1))[0]
+    return f"{entities}{HEAD}{inside}</scene>".encode(encoding, errors="surrogatepass")
+
+
+def _element(rng: Random) -> str:
     choice = rng.random()
-    if choice < 0.03:
-        return f"{LAUGHS}{HEAD}{inside}<default name='x' value='&j;'/></scene>".encode()
-    if choice < 0.06:
-        return f"{EXTERNAL}{HEAD}{inside}<default name='x' value='&e;'/></scene>".encode()
     if choice < 0.1:
-        return f"{HEAD}{inside}</scene>".encode(rng.choice(("utf-16", "utf-32", "utf-8-sig")))
-    return f"{HEAD}{inside}</scene>".encode(errors="surrogatepass")
+        depth, tag = rng.choice((30, 300, 3000, 30000)), rng.choice(("shape", "bsdf", "transform", "scene"))
+        return f'<{tag} type="cube">' * depth + f"</{tag}>" * depth
+    if choice < 0.2:
+        return rng.choice(MANY) * rng.choice((2, 50, 2000))
+    values, patterns = rng.choices(ELEMENTS, (2, 2, 2, 1))[0]
+    value = rng.choice(values).replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+    return rng.choice(patterns).replace("@", value)
 
 
-def _plugin(rng: Random) -> str:
-    tag = rng.choice(("shape", "emitter", "bsdf", "integrator", "sensor", "film", "texture", "medium", "volume", "x"))
-    return f'<{tag} type="{_escaped(rng.choice(PLUGINS))}"/>'
+POINTS = np.array([(-50, -50, 1000), (50, -50, 1000), (50, 50, 1000), (-50, 50, 1000)])
+FACES = np.array([(0, 1, 2), (0, 2, 3)])
+INDICES = ("4", "-1", "1000", str(2**31 - 1), str(-(2**31)), str(2**32 - 1))
+COUNTS = ("0", "-1", "3", "5", str(10**6), str(4 * 10**9), str(2**63), str(10**30))
 
 
-def _file(rng: Random) -> str:
-    name = _escaped(rng.choice(OUTSIDE))
-    return rng.choice(
-        (
-            f'<include filename="{name}"/>',
-            f'<path value="{name}"/>',
-            f'<shape type="ply"><string name="filename" value="{name}"/></shape>',
-            f'<shape type="obj"><string name="filename" value="{name}"/></shape>',
-            f'<shape type="serialized"><string name="filename" value="{name}"/></shape>',
-            f'<emitter type="envmap"><string name="filename" value="{name}"/></emitter>',
-            f'<shape type="cube"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
-            f'<string name="filename" value="{name}"/></texture></bsdf></shape>',
-            f'<shape type="cube"><bsdf type="diffuse"><spectrum name="reflectance" filename="{name}"/></bsdf></shape>',
-            f'<default name="f" value="{name}"/><shape type="ply"><string name="filename" value="$f"/></shape>',
-            f'<default name="t" value="{name}"/><shape type="$t"/>',
-        )
-    )
+def _lines(start: str, rows: np.ndarray, end: str = "") -> str:
+    return "".join(f"{start}{' '.join(f'{value}{end}' for value in row)} \n" for row in rows)
 
 
-def _nested(rng: Random) -> str:
-    depth, tag = rng.choice((30, 300, 3000, 30000)), rng.choice(("shape", "bsdf", "transform", "scene"))
-    return f'<{tag} type="cube">' * depth + f"</{tag}>" * depth
+OBJ = f"{_lines('v ', POINTS)}vt 0 0 \nvt 1 0 \nvn 0 0 -1 \n{_lines('f ', FACES + 1, '/1/1')}".encode()
+PLY_HEAD = """ply
+format @ 1.0
+element vertex 4
+property float x
+property float y
+property float z
+element face 2
+property list uchar int vertex_indices
+end_header
+"""
+PLY = (PLY_HEAD.replace("@", "ascii") + _lines("", POINTS) + _lines("3 ", FACES)).encode()
 
 
-def _many(rng: Random) -> str:
-    return rng.choice(
-        (BLOCK, "<ref id='x'/>", "<default name='a' value='b'/>", '<include filename="worlds/corridor.xml"/>')
-    ) * rng.choice((2, 50, 2000))
+def _binary_ply(order: str, name: str) -> bytes:
+    faces = b"".join(b"\3" + face.astype(f"{order}i4").tobytes() for face in FACES)
+    return PLY_HEAD.replace("@", name).encode() + POINTS.astype(f"{order}f4").tobytes() + faces
 
 
-def _number(rng: Random) -> str:
-    value = rng.choice(NUMBERS)
-    radiance = f'<rgb name="radiance" value="{value}"/>'
-    return rng.choice(
-        (
-            f'<shape type="sphere"><float name="radius" value="{value}"/>{WHERE}</shape>',
-            f'<emitter type="point"><rgb name="intensity" value="{value}"/></emitter>',
-            f'<shape type="cube"><transform name="to_world"><scale value="{value}"/></transform></shape>',
-            f'<shape type="cube"><transform name="to_world"><translate z="{value}"/></transform></shape>',
-            f'<integrator type="path"><integer name="max_depth" value="{value}"/></integrator>',
-            f'<shape type="rectangle"><emitter type="area">{radiance}</emitter>{WHERE}</shape>',
-        )
-    )
-
-
-def _name(rng: Random) -> str:
-    name = _escaped(rng.choice(("", "x" * 10000, "\x85", "\u202e", "a.b", "ommatid_target", "é", "\x7f[31m", "x\ny")))
-    return rng.choice(
-        (
-            f'<shape type="cube" id="{name}"/>',
-            f'<ref id="{name}"/>',
-            f'<float name="{name}" value="1"/>',
-            f'<{"x"} {"y"}="{name}"/>',
-        )
-    )
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
-
-
-ELEMENTS = (_plugin, _plugin, _file, _file, _nested, _many, _number, _number, _name)
-POINTS = ((-50, -50, 1000), (50, -50, 1000), (50, 50, 1000), (-50, 50, 1000))
-FACES = ((0, 1, 2), (0, 2, 3))
-INDICES = (4, -1, 1000, 2**31 - 1, -(2**31), 2**32 - 1)
-COUNTS = (0, -1, 3, 5, 10**6, 4 * 10**9, 2**63, 10**30)
-
-
-def ply(rng: Random, original: bytes) -> bytes:
-    """Return a PLY file whose header and contents may disagree."""
-    if rng.random() < 0.3:
-        return damaged(rng, original)
-    points = [list(map(float, point)) for point in POINTS]
-    faces = [list(face) for face in FACES]
-    counts = [str(len(points)), str(len(faces))]
-    kind = rng.choice(("ascii", "binary_little_endian", "binary_big_endian"))
-    change = rng.randrange(6)
-    if change == 0:
-        faces[rng.randrange(2)][rng.randrange(3)] = rng.choice(INDICES)
-    elif change == 1:
-        counts[rng.randrange(2)] = str(rng.choice(COUNTS))
-    elif change == 2:
-        points[rng.randrange(4)][rng.randrange(3)] = rng.choice((np.nan, np.inf, 1e38, 1e300))
-    elif change == 3:
-        faces[0] = faces[0][: rng.choice((0, 1, 2))] if rng.random() < 0.5 else faces[0] * rng.choice((2, 80))
-    version, types, names = "1.0", ["float"] * 3, rng.choice(("vertex_index", "vertex_indices"))
-    if change == 4:
-        version, names = rng.choice(("1.0", "9.9", "x")), rng.choice((names, "x", "vertex_index x"))
-        types[rng.randrange(3)] = rng.choice(("float", "double", "uchar", "x", "list uchar float"))
-    properties = "".join(f"property {kind_of} {axis}\n" for kind_of, axis in zip(types, "xyz", strict=True))
-    header = (
-        f"ply\nformat {kind} {version}\nelement vertex {counts[0]}\n{properties}"
-        f"element face {counts[1]}\nproperty list uchar int {names}\nend_header\n"
-    )
-    return header.encode() + _ply_body(kind, points, faces)
-
-
-def _ply_body(kind: str, points: list[list[float]], faces: list[list[int]]) -> bytes:
-    if kind == "ascii":
-        lines = [" ".join(map(str, point)) for point in points]
-        lines += [" ".join(map(str, (len(face), *face))) for face in faces]
-        return "\n".join(lines).encode() + b"\n"
-    order = "<" if "little" in kind else ">"
-    with np.errstate(over="ignore"):
-        body = np.array(points).astype(f"{order}f4").tobytes()
-    for face in faces:
-        body += struct.pack(f"{order}B", len(face) % 256)
-        body += b"".join(struct.pack(f"{order}I", index % 2**32) for index in face)
-    return body
-
-
-def obj(rng: Random, original: bytes) -> bytes:
-    """Return an OBJ file with indices that name nothing, or damaged bytes."""
-    if rng.random() < 0.4:
-        return damaged(rng, original)
-    words = original.decode().split(" ")
-    extreme = (
-        *map(str, INDICES),
-        "nan",
-        "inf",
-        "1/1/1",
-        "1//9",
-        "-9//1",
-        "0",
-        "x",
-        "1e400",
-        "9" * 5000,
-        "\n",
-        "v",
-        "f",
-        "\x00",
-    )
-    for _ in range(rng.choice((1, 1, 2))):
-        words[rng.randrange(len(words))] = rng.choice(extreme)
-    return " ".join(words).encode()
-
-
-OBJ = b"".join(
-    (
-        *(b"v %d %d %d\n" % point for point in POINTS),
-        b"vt 0 0 \nvt 1 0 \nvn 0 0 -1 \n",
-        *(b"f %d/1/1 %d/2/1 %d/1/1 \n" % tuple(index + 1 for index in face) for face in FACES),
-    )
+PLYS = [PLY, _binary_ply("<", "binary_little_endian"), _binary_ply(">", "binary_big_endian")]
+EXTREME = ("nan", "inf", "1e38", "1e300", "1e400", "x", "0", "\n", "\x00", "9" * 5000)
+ply = words_exchanged(
+    b" |\n", *INDICES, *COUNTS, *EXTREME, "9.9", "double", "uchar", "list uchar float", "vertex_index", "80"
 )
-PLY = (
-    b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-    b"element face 2\nproperty list uchar int vertex_indices\nend_header\n"
-    + _ply_body("ascii", [list(map(float, point)) for point in POINTS], [list(face) for face in FACES])
-)
+obj = words_exchanged(b" ", *INDICES, *EXTREME, "1/1/1", "1//9", "-9//1", "v", "f")
 
 
 def serialized(rng: Random, original: bytes) -> bytes:
     """Return a file of Mitsuba's own meshes whose counts, indices and compressed contents may disagree."""
     if rng.random() < 0.3:
         return damaged(rng, original)
-    points, faces = np.array(POINTS, "<f4"), np.array(FACES, "<u4")
-    counts = [len(points), len(faces)]
-    change = rng.randrange(5)
-    if change == 4:
-        return serialized_mesh()
-    if change == 0:
-        faces[rng.randrange(2), rng.randrange(3)] = rng.choice(INDICES) % 2**32
-    elif change == 1:
-        counts[rng.randrange(2)] = rng.choice(COUNTS) % 2**64
-    name, flags = rng.choice((b"", b"x" * 100, b"\x1b[31m")), rng.choice((0x1000, 0x1000, 0x2000, 0xFFFF, 0))
-    body = struct.pack("<I", flags) + name + b"\0" + struct.pack("<QQ", *counts) + points.tobytes() + faces.tobytes()
-    body += bytes(rng.choice((0, 0, 0, 10**8)) if change == 2 and rng.random() < 0.2 else 0)
-    header = struct.pack("<HH", rng.choice((0x041C, 0x041C, 0x041C, 0)), rng.choice((4, 4, 3, 99)))
-    content = header + zlib.compress(body)
-    offsets = rng.choice(([0], [0], [0, 2**62], [2**31], []))
-    return (
-        content + struct.pack(f"<{len(offsets)}Q", *offsets) + struct.pack("<I", rng.choice((len(offsets), 1, 2**31)))
-    )
+    counts, faces = [len(POINTS), len(FACES)], FACES.copy()
+    if rng.random() < 0.3:
+        faces[rng.randrange(2), rng.randrange(3)] = int(rng.choice(INDICES))
+    if rng.random() < 0.3:
+        counts[rng.randrange(2)] = int(rng.choice(COUNTS)) % 2**64
+    flags, name = rng.choice((0x1000, 0x1000, 0x2000, 0xFFFF, 0)), rng.choice((b"x", b"", b"x" * 100, b"\x1b[31m"))
+    version, offsets = rng.choice((4, 4, 4, 3, 99)), rng.choice(((0,), (0,), (0,), (0, 2**62), (2**31,), ()))
+    body = struct.pack("<I", flags) + name + struct.pack("<BQQ", 0, *counts)
+    body += POINTS.astype("<f4").tobytes() + faces.astype("<u4").tobytes() + bytes(10**8 * (rng.random() < 0.05))
+    end = struct.pack(f"<{len(offsets)}QI", *offsets, len(offsets))
+    return struct.pack("<HH", 0x041C, version) + zlib.compress(body) + end
 
 
 def serialized_mesh() -> bytes:
     """Return a valid file of one mesh."""
     body = struct.pack("<I", 0x1000) + b"x\0" + struct.pack("<QQ", len(POINTS), len(FACES))
-    body += np.array(POINTS, "<f4").tobytes() + np.array(FACES, "<u4").tobytes()
-    return struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<Q", 0) + struct.pack("<I", 1)
+    body += POINTS.astype("<f4").tobytes() + FACES.astype("<u4").tobytes()
+    return struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, 1)
 
 
-def read_world(path: Path) -> str:
+def read_world(path: Path) -> object:
     """Read a world with all its checks, and build it."""
     from ommatid.scenes import scene
     from ommatid.simulate.renderer import world
@@ -248,13 +166,12 @@ def read_world(path: Path) -> str:
     described = scene.read(path.with_name(SCENE), [f"world.file={path.name}"])
     files = world.files(described)
     built = world.stage(described, "scalar_rgb", None)
-    return fingerprint(len(files), len(built.scene.shapes()), built.scene.bbox())
+    return path.read_bytes(), len(files), len(built.scene.shapes()), built.scene.bbox()
 
 
-def read_mesh(path: Path) -> str:
+def read_mesh(path: Path) -> object:
     """Read a world of one mesh."""
-    kind = path.suffix[1:]
-    shape = f'<shape type="{kind}"><string name="filename" value="{path.name}"/></shape>'
+    shape = f'<shape type="{path.suffix[1:]}"><string name="filename" value="{path.name}"/></shape>'
     world = path.with_name("mesh.xml")
     world.write_text(f"{HEAD}{LIGHT}{shape}</scene>", encoding="utf-8")
     try:
@@ -263,14 +180,10 @@ def read_mesh(path: Path) -> str:
         world.unlink()
 
 
-WORLDS = (
-    FileType("world, elements", "w.xml", lambda _: [PLAIN.encode()], elements, read_world, ()),
-    FileType("world, PLY", "mesh.ply", lambda _: [PLY], ply, read_mesh, ()),
-    FileType(
-        "world, serialized", "mesh.serialized", lambda _: [serialized_mesh()], serialized, read_mesh, (), share=0.5
-    ),
-    FileType("world, OBJ", "mesh.obj", lambda _: [OBJ], obj, read_mesh, (), share=0.5),
-)
+def of_mesh(name: str, suffix: str, originals: list[bytes], damage: Engine) -> FileType:
+    """Return a type of meshes."""
+    share = 1.0 if suffix == "ply" else 0.5
+    return FileType(f"world, {name}", f"mesh.{suffix}", lambda _: originals, damage, read_mesh, (), share=share)
 
 
 def rendered(rng: Random, folder: Path) -> CommandCase:
@@ -279,4 +192,11 @@ def rendered(rng: Random, folder: Path) -> CommandCase:
     return CommandCase(("render", SCENE, "-o", "new", "--set", "world.file=w.xml", "--set", "world.white=1"))
 
 
-RENDERED = (CommandFamily("world, rendered", rendered, share=0.2),)
+WORLDS = (
+    FileType("world, XML", "world.xml", gallery_files("worlds/*.xml"), damaged, read_world, ()),
+    FileType("world, elements", "w.xml", lambda _: [PLAIN.encode()], elements, read_world, ()),
+    of_mesh("PLY", "ply", PLYS, ply),
+    of_mesh("serialized", "serialized", [serialized_mesh()], serialized),
+    of_mesh("OBJ", "obj", [OBJ], obj),
+    CommandFamily("world, rendered", rendered, share=0.2),
+)

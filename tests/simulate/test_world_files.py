@@ -15,25 +15,96 @@ from ommatid.simulate.renderer.worlds.trial import try_world
 from ..conftest import TINY, Command
 from ..examples import GALLERY
 from ..fuzz.families.worlds import PLY, serialized_mesh
-from .hostile_worlds import FAMILIES, hostile_world, mesh, scene
 
 WHERE = "test.toml: world.file"
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 1 2 3\n"
-EACH = 3  # worlds of each family
+MESH, LAUGHS = serialized_mesh(), range(9)
+BEYOND = "beyond"  # a folder beside the world's
+
+
+def scene(content: str) -> str:
+    return f'<scene version="3.0.0">{content}<emitter type="constant"/></scene>'
+
+
+def mesh(name: str) -> str:
+    kind = name.rpartition(".")[2]
+    return scene(f'<shape type="{kind}"><string name="filename" value="{name}"/></shape>')
+
+
+def including(*names: str) -> str:
+    return scene("".join(f'<include filename="{name}"/>' for name in names))
+
+
+def cycle(length: int) -> dict[str, str | bytes]:
+    return {"world.xml": including("0.xml")} | {f"{i}.xml": including(f"{(i + 1) % length}.xml") for i in range(length)}
+
+
+ENTITIES = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10 if i else "ha"}">' for i in LAUGHS)
+DEFAULTS = "".join(f'<default name="a{i}" value="{f"$a{i - 1}" * 10 if i else "ha"}"/>' for i in LAUGHS)
+OUTSIDE = ("/tmp", f"../{BEYOND}", f"./x/../../{BEYOND}", "link")
+PLUGINS = ("evil", "../evil", "../x/evil", "./sphere", "sphere.so", "plugins/sphere", "", "scene", "ȀƐ!", "[\x7f")
+# Files of worlds that have to be refused: world.xml, and what it names.
+HOSTILE: list[dict[str, str | bytes]] = [
+    # indices beyond the vertices, and files that are cut off or damaged; Mitsuba reads negative indices as 0
+    *(
+        {"world.xml": mesh("m.ply"), "m.ply": PLY.replace(b"3 0 1 2", b"3 0 %d 1" % i)}
+        for i in (4, 5, 10**6, 2**31 - 1)
+    ),
+    *(
+        {"world.xml": mesh("m.serialized"), "m.serialized": bad}
+        for bad in (MESH[:20], b"", MESH[:10] + b"\xff" * 9 + MESH[19:])
+    ),
+    # a million laughs: of entities, of variables, of included files
+    {"world.xml": f'<!DOCTYPE scene [{ENTITIES}]>{scene("""<string name="x" value="&a8;"/>""")}'},
+    {"world.xml": scene(f'{DEFAULTS}<string name="x" value="$a8"/>')},
+    {
+        "world.xml": including("0.xml"),
+        **{f"{i}.xml": including(*[f"{i + 1}.xml"] * 10) for i in LAUGHS},
+        "9.xml": scene(""),
+    },
+    *map(cycle, (1, 2, 20)),
+    *(
+        {"world.xml": scene(f'<shape type="sphere"><{tag} type="{kind}"/></shape>')}
+        for tag in ("shape", "bsdf", "emitter", "integrator", "sampler", "texture")
+        for kind in PLUGINS
+    ),
+    *(
+        {
+            "world.xml": scene(f'<default name="kind" value="{kind}"/><include filename="part.xml"/>'),
+            "part.xml": scene('<shape type="$kind"/>'),
+        }
+        for kind in PLUGINS
+    ),
+    *(
+        {"world.xml": scene(content)}
+        for name in OUTSIDE
+        for content in (
+            f'<include filename="{name}/part.xml"/>',
+            f'<path value="{name}"/>',
+            f'<default name="at" value="{name}"/><shape type="obj"><string name="filename" value="$at/m.obj"/></shape>',
+        )
+    ),
+]
 
 
 def test_hostile_worlds_are_refused_in_one_short_sentence(tmp_path: Path) -> None:
     """Files by their XML, before Mitsuba starts; meshes in the process that reads them first."""
-    for number in range(EACH * len(FAMILIES)):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        path = hostile_world(number, folder)
+    for place in (tmp_path / BEYOND, tmp_path / "in" / "x"):
+        place.mkdir(parents=True)
+    (tmp_path / BEYOND / "m.obj").write_text(OBJ, encoding="utf-8")
+    (tmp_path / BEYOND / "part.xml").write_text(scene(""), encoding="utf-8")
+    folder = tmp_path / "in"
+    (folder / "link").symlink_to(tmp_path / BEYOND)
+    for files in HOSTILE:
+        for name, content in files.items():
+            (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        path = folder / "world.xml"
         with pytest.raises(InputError) as refused:
             try_world(check_world_files(path, WHERE), "scalar_rgb", f"{WHERE}: {path}")
         sentence = str(refused.value)
-        assert sentence.startswith(f"{WHERE}: ")
-        assert sentence.isprintable()
-        assert len(sentence) <= 300 + 2 * len(str(folder))
+        assert sentence.startswith(f"{WHERE}: "), files
+        assert sentence.isprintable(), files
+        assert len(sentence) <= 300 + 2 * len(str(folder)), files
 
 
 def test_sound_meshes_are_read(tmp_path: Path) -> None:

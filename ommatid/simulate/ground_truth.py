@@ -23,7 +23,7 @@ from ommatid.scenes.setup import Setup
 from .renderer.variant import choose
 from .renderer.world import describe
 from .sampling.passes import plan
-from .world_view import ideal_camera, rendered_world
+from .world_view import ideal_camera, rendered_world, views
 
 FINER = 3  # depth is the median of 3 x 3 points of a pixel
 TRUER = 4  # times the samples of a sensor pixel, whose own noise changes the estimate by far more
@@ -69,12 +69,8 @@ def _depth(world: Any, camera: Camera) -> FloatArray:
     """Return the depth, (rows, columns), that rays from the array's centre meet; infinite where they meet nothing."""
     from .renderer.worlds.building import depths_met
 
-    down, across = (
-        (count / 2 - (np.arange(FINER * count) + 0.5) / FINER) * camera.target_pitch for count in camera.shape
-    )
-    y, x = np.meshgrid(down, across, indexing="ij")
-    directions = np.stack([x.ravel(), y.ravel(), np.full(x.size, camera.distance)], axis=1)
-    points = depths_met(world.scene, world.placement, np.zeros_like(directions), directions)
+    rays = views(ideal_camera(camera), (FINER * camera.rows, FINER * camera.columns))
+    points = depths_met(world.scene, world.placement, *rays)
     return np.asarray(np.median(points.reshape(camera.rows, FINER, camera.columns, FINER), axis=(1, 3)))
 
 

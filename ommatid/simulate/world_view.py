@@ -224,14 +224,14 @@ def _box_words(box: Sequence[Sequence[float]] | None) -> str:
     return ", ".join(f"{axis} {least:.5g} to {most:.5g}" for axis, least, most in zip("xyz", *box, strict=True)) + " mm"
 
 
-def views(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Return origins and directions, (n, 3), of rays from the middles of lenses to points of their views."""
+def views(camera: Camera, sides: tuple[int, int] = (SIDE, SIDE)) -> tuple[FloatArray, FloatArray]:
+    """Return origins and directions, (n, 3), of rays from the middles of lenses to a grid of points of their views."""
     every = max(1, -(-len(camera.sub_imagers) // SUB_IMAGERS))
-    shares = (np.arange(SIDE) + 0.5) / SIDE
+    shares = [(np.arange(side) + 0.5) / side for side in sides]
     origins, directions = list[FloatArray](), list[FloatArray]()
     for sub in camera.sub_imagers[::every]:
-        rows, columns = (float(sub.type.ratio) * count for count in sub.type.pixels)
-        down, across = np.meshgrid(shares * rows, shares * columns, indexing="ij")
+        places = (float(sub.type.ratio) * count * share for count, share in zip(sub.type.pixels, shares, strict=True))
+        down, across = np.meshgrid(*places, indexing="ij")
         x = (camera.columns / 2 - float(sub.window[1]) - across.ravel()) * camera.target_pitch
         y = (camera.rows / 2 - float(sub.window[0]) - down.ravel()) * camera.target_pitch
         start = np.tile([*sub.lens, camera.distance - sub.distance], (x.size, 1))

@@ -240,16 +240,9 @@ def views(camera: Camera, sides: tuple[int, int] = (SIDE, SIDE)) -> tuple[FloatA
     return np.concatenate(origins), np.concatenate(directions)
 
 
-def ideal_camera(camera: Camera, finer: int = 1) -> Camera:
-    """Return a pinhole in the array's centre with `finer` x `finer` sensor pixels per pixel of f."""
-    lens_type = LensType(
-        "truth",
-        Fraction(1, finer),
-        (1, 1),
-        (camera.rows * finer, camera.columns * finer),
-        (Fraction(1), Fraction(1)),
-        (0, 0),
-    )
+def ideal_camera(camera: Camera) -> Camera:
+    """Return a pinhole in the array's centre with a sensor pixel per pixel of f."""
+    lens_type = LensType("truth", Fraction(1), (1, 1), camera.shape, (Fraction(1), Fraction(1)), (0, 0))
     return replace(
         camera, types=(lens_type,), wavelength=None, tolerance=None, lens_columns=None, walls=True, sensor_distance=None
     )

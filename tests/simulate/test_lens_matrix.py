@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import sparse, stats
+from scipy import stats
 
 from ommatid.scenes.optics.field import TOLERANCE, optics_of
 from ommatid.scenes.optics.point_spread import density, grid_of, point_spread
@@ -16,7 +16,7 @@ from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import familywise, needs
 from .test_lenses import built
-from .test_lenses_against_ideal import scores
+from .test_lenses_against_ideal import scores, traced_in_a_world
 
 SAMPLES = 2**14
 ONE = (("1/3", [1, 2], [3, 3]),)
@@ -95,21 +95,9 @@ def test_an_entry_is_the_integral_of_the_point_spread_over_pixel_and_texel() -> 
 def test_rays_that_follow_the_distance_of_what_they_meet(kind: str) -> None:
     """In a world as before a flat target: H of a flat target that lenses have to find."""
     needs("llvm_ad_mono")
-    from ommatid.simulate.renderer.renderer import Renderer
-
-    from .world_files import distance_to_target
-
     surfaces, wavelength, more = CASES[kind]
     camera = setup_of(surfaces, wavelength, **more).camera
-    renderer = Renderer(camera, "llvm_ad_mono", "independent", together=False)
-    scene: Any = renderer
-    scene._generators["A"].lens.follow(distance_to_target(renderer))
-    texels, weights = renderer.hits(renderer.pixels("A"), 4 * SAMPLES, lambda index: index + 7)
-    assert weights is not None
-    found = np.zeros((camera.measurements, camera.unknowns + 1))
-    np.add.at(found, (np.arange(camera.measurements)[:, None], texels), weights)
-    matrix = sparse.csr_array(found[:, :-1] / weights.sum(axis=1)[:, None])
-    found = scores(matrix, ideal_matrix(camera), 4 * SAMPLES)
+    found = scores(traced_in_a_world(camera, 4 * SAMPLES), ideal_matrix(camera), 4 * SAMPLES)
     assert np.abs(found).max() < stats.norm.isf(familywise(found.size) / 2)
 
 

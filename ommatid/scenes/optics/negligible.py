@@ -313,11 +313,5 @@ def _in_recording(scene: Scene, camera: Camera) -> list[SkippedEffect]:
     if scene.sensor is not None:
         shot = negligible_shot_noise(scene, camera)
         return [] if shot is None else [shot]
-    if scene.noise is None:
-        return [SkippedEffect("sensor noise and quantisation", "the scene has no [noise] and no [sensor]")]
-    skipped: list[SkippedEffect] = []
-    if scene.noise.variance == 0:
-        skipped.append(SkippedEffect("sensor noise", "noise.variance is 0"))
-    if scene.noise.bits is None:
-        skipped.append(SkippedEffect("quantisation", "the scene has no noise.bits"))
-    return skipped
+    why = "the scene has no [noise] and no [sensor]"
+    return [SkippedEffect("sensor noise and quantisation", why)] if scene.noise is None else []

@@ -27,7 +27,6 @@ from .camera import Camera, derive
 from .fitted.fitted_matrix import FittedMatrix, Views
 from .fitted.kernels import KernelFootprints, read_kernels
 from .formats import npz
-from .formats.npz import Headers
 from .formats.provenance import checked
 from .model import MeasuredRows, Model, fitted_model, measured_rows
 from .scene import parse_stored
@@ -140,7 +139,8 @@ def _arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        content = npz.read(path, check_headers)
+        content = npz.read(path)
+        check_shapes(content)
         arrays = {name: each for name, each in content.items() if name not in (*OF_SCIPY, "ommatid")}
         record = parse_json(str(content["ommatid"][()]))
         description, seal = record["description"], record["sha256"]
@@ -175,25 +175,27 @@ EXPECTED = {  # dimensions, kinds and bytes of a number
 }
 
 
-def check_headers(headers: Headers) -> None:
-    """Raise ValueError for arrays that no model has, before any of them is read."""
-    for name, (shape, dtype) in headers.items():
+def check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise ValueError for arrays that no model has."""
+    shapes = {name: each.shape for name, each in arrays.items()}
+    for name, shape in shapes.items():
+        dtype = arrays[name].dtype
         if name in EXPECTED:
             dimensions, kinds, sizes = EXPECTED[name]
             if len(shape) != dimensions or dtype.kind not in kinds or dtype.itemsize not in sizes:
                 raise ValueError(f"{name} is of type {dtype} and shape {shape}")
-        elif dtype.kind in "US" and (int(np.prod(shape)) > MOST_TEXTS or dtype.itemsize > LONGEST_TEXT):
+        elif dtype.kind in "US" and (arrays[name].size > MOST_TEXTS or dtype.itemsize > LONGEST_TEXT):
             raise ValueError(f"{name} has {dtype} texts of shape {shape}")
         axis = DIRECTIONS.get(name.rpartition(".")[2])
         if axis is not None and len(shape) == 3 and shape[axis] > MOST_DIRECTIONS:
             raise ValueError(f"{name} has {shape[axis]} directions of errors, more than {MOST_DIRECTIONS}")
-    if "shape" in headers and headers["shape"].shape != (2,):
-        raise ValueError(f"shape is of shape {headers['shape'].shape}")
-    if "batches" in headers and headers["batches"].shape[0] > MOST_BATCHES:
-        raise ValueError(f"it has {headers['batches'].shape[0]} batches, more than {MOST_BATCHES}")
+    if "shape" in shapes and shapes["shape"] != (2,):
+        raise ValueError(f"shape is of shape {shapes['shape']}")
+    if "batches" in shapes and shapes["batches"][0] > MOST_BATCHES:
+        raise ValueError(f"it has {shapes['batches'][0]} batches, more than {MOST_BATCHES}")
     for name in ("indices", "variance", "batches"):
-        if {"data", name} <= headers.keys() and headers[name].shape[-1:] != headers["data"].shape:
-            raise ValueError(f"{name} is of shape {headers[name].shape} for {headers['data'].shape[0]} entries")
+        if {"data", name} <= shapes.keys() and shapes[name][-1:] != shapes["data"]:
+            raise ValueError(f"{name} is of shape {shapes[name]} for {shapes['data'][0]} entries")
 
 
 def csr_matrix(arrays: Mapping[str, NDArray[Any]], shape: tuple[int, ...]) -> sparse.csr_array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ommatid.analysis.depth_error import PICTURE, depth_error_of_run, disparity, draw, error_by_depth, rows
 from ommatid.scenes.formats.exr import Part, write
 from ommatid.scenes.formats.picture import write_truth
-from ommatid.scenes.formats.picture_file import decode
+from ommatid.scenes.formats.picture_file import read_picture
 from ommatid.scenes.scene import TRUTH
 
 from ..examples import camera as camera_of
@@ -94,7 +94,7 @@ def test_a_figure_is_drawn(tmp_path: Path, distance: float | None) -> None:
     depth, error, variance = maps()
     depth[:] = depth if distance is None else distance
     draw(tmp_path / PICTURE, CAMERA, error_by_depth(CAMERA, depth, error, variance), "$a$ title")
-    drawn: NDArray[Any] = decode(tmp_path / PICTURE, "test")
+    drawn: NDArray[Any] = read_picture(tmp_path / PICTURE, "test").pixels
     assert drawn.shape[0] > 400
     assert drawn.std() > 5
 

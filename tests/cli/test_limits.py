@@ -99,7 +99,7 @@ def test_an_array_smaller_than_its_header_states_is_refused(tmp_path: Path) -> N
     shape = "(100000, 100000)"
     (tmp_path / "a.npy").write_bytes(npy_of(shape))
     with pytest.raises(InputError, match="could not be read as a picture"):
-        picture_file.decode(tmp_path / "a.npy", "here")
+        picture_file.read_picture(tmp_path / "a.npy", "here")
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("x.npy", npy_of(shape))
     with pytest.raises(ValueError, match=r"."):

@@ -32,7 +32,6 @@ OWN = {
     "ommatid.scenes.tables.gallery": "scenes of the installation",
     "ommatid.scenes.formats.npz": "a stream that is open, and members of an archive",
     "ommatid.scenes.formats.picture": "pictures, which are checked before",
-    "ommatid.scenes.formats.png_and_jpeg": "bytes in memory, and a stream that is open",
     "ommatid.scenes.formats.exr": "/dev/null",
     "ommatid.simulate.renderer.world": "files of a world",
     "ommatid.simulate.sampling.checkpoint": "a temporary file, which it writes",

@@ -42,7 +42,7 @@ def test_every_page_is_a_frame_and_is_turned_by_its_own_orientation(tmp_path: Pa
 
 def test_jpeg_is_refused_by_its_content(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(made.jpeg(np.zeros((16, 16), np.uint8)))
-    with pytest.raises(InputError, match=r"a\.png: expected a PNG file, got a JPEG, which does not keep the sensor's"):
+    with pytest.raises(InputError, match=r"a\.png could not be read as a picture \(not a PNG file\)"):
         stored_pictures(tmp_path / "a.png", "images")
 
 

@@ -6,6 +6,7 @@ import os
 import struct
 import tracemalloc
 import zlib
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,6 +21,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats.picture import conversions, load
 from ommatid.scenes.formats.picture_file import read_picture
 
+from ..fuzz.verdicts import PeakMemory
 from . import picture_bytes as made
 from .test_picture import looking_at
 
@@ -111,20 +113,20 @@ def animated(frames: int) -> bytes:
     return made.png(np.zeros((8, 8)), 0, 8, made.chunk(b"acTL", struct.pack(">II", frames, 0)), more)
 
 
-def test_files_of_several_pictures_are_refused_with_their_number(tmp_path: Path) -> None:
+def test_files_of_several_pictures_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(animated(7))
-    assert "expected one picture, got 7 frames" in refusal(tmp_path / "a.png")
+    assert "expected one picture, got several frames" in refusal(tmp_path / "a.png")
     assert pixels_in(tmp_path / "still.png", animated(1)).shape == (8, 8)
     for count in (2, 3, 4):  # three and four pages are not the colours of one
         WRITE_TIFF(tmp_path / "a.tif", np.zeros((count, 9, 9), np.uint8), photometric="minisblack")
-        assert f"expected one picture, got {count} pages" in refusal(tmp_path / "a.tif")
+        assert "expected one picture, got several" in refusal(tmp_path / "a.tif")
     with tifffile.TiffWriter(tmp_path / "b.tif") as file:
         for size in (8, 12):
             cast(Any, file).write(np.zeros((size, size), np.uint8), photometric="minisblack", metadata=None)
-    assert "got 2 pages" in refusal(tmp_path / "b.tif")
+    assert "got several" in refusal(tmp_path / "b.tif")
     one, two = (Image.fromarray(np.full((16, 16), value, np.uint8)) for value in (9, 90))
     one.save(tmp_path / "a.jpg", "MPO", save_all=True, append_images=[two, two])
-    assert "expected one picture, got 3 pictures" in refusal(tmp_path / "a.jpg")
+    assert "expected one picture, got several pictures" in refusal(tmp_path / "a.jpg")
 
 
 def test_a_reduced_copy_of_a_page_is_no_other_page(tmp_path: Path) -> None:
@@ -200,14 +202,13 @@ def test_sizes_are_refused_from_headers(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_file_too_short_for_its_header_is_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However much memory there is, pixels are not allocated."""
+    """However much memory there is, its pixels are not decoded."""
     write_large_headers(tmp_path)
     monkeypatch.setattr("ommatid.runtime.machine.free_memory", lambda: 10**15)
-    tracemalloc.start()
+    memory = PeakMemory()
     for path in sorted(tmp_path.iterdir()):
-        assert "it is damaged" in refusal(path) or "cut short" in refusal(path), path.name
-    assert tracemalloc.get_traced_memory()[1] < 50_000_000
-    tracemalloc.stop()
+        assert "it is damaged" in refusal(path) or "cut short" in refusal(path) or "got fewer" in refusal(path)
+    assert not memory.excess()
 
 
 @pytest.mark.parametrize(
@@ -228,7 +229,11 @@ def test_a_strip_is_not_inflated_beyond_its_pixels(compression: str, packed: byt
         for tag, value in ((273, len(content)), (279, len(packed))):  # place and length of the strip
             content[tags[tag].offset + 2 : tags[tag].offset + 12] = struct.pack("<HII", 4, 1, value)
     (tmp_path / "a.tif").write_bytes(content + packed)
-    assert "damaged" in refusal(tmp_path / "a.tif")
+    tracemalloc.start()
+    with nullcontext() if compression == "tiff_lzw" else pytest.raises(InputError, match="damaged"):
+        assert read_picture(tmp_path / "a.tif", "here").pixels.shape == LETTER.shape  # LZW ends with the pixels
+    assert tracemalloc.get_traced_memory()[1] < 2_000_000
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize("options", [{"tile": (16, 32)}, {"tile": (16, 32), "compression": "lzw"}, {"rowsperstrip": 5}])
@@ -285,7 +290,7 @@ def test_a_circular_list_of_pages_ends(length: int, tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[last : last + 4] = struct.pack("<I", second)
     path.write_bytes(content)
-    assert f"got {length} pages" in refusal(path)
+    assert "circular" in refusal(path)
 
 
 def test_frames_without_pages_are_refused(tmp_path: Path) -> None:
@@ -317,7 +322,7 @@ def test_deep_pictures_and_several_parts_are_refused(tmp_path: Path) -> None:
     pixels = np.zeros((8, 10), np.float32)
     parts = [library.Part({}, {"Y": pixels}, name=name) for name in ("left", "right")]
     library.File(parts).write(str(tmp_path / "a.exr"))
-    assert "expected one picture, got 2 parts" in refusal(tmp_path / "a.exr")
+    assert "expected one picture, got several parts" in refusal(tmp_path / "a.exr")
     deep = np.empty((8, 10), object)
     for index in np.ndindex(deep.shape):
         deep[index] = np.ones(2, np.float32)

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +28,10 @@ from ommatid.runtime.input_files import check_regular, parse_json
 from ommatid.runtime.machine import check_memory
 from ommatid.runtime.printable import printable
 
-from .stored_picture import StoredPicture, check_single, check_size
+from .stored_picture import BYTES, StoredPicture, several
 
 ATTRIBUTE = "ommatid"
-BOUNDED = ("NO_COMPRESSION", "RLE_COMPRESSION", "ZIPS_COMPRESSION", "ZIP_COMPRESSION")  # ratio as Deflate's or below
-MOST_DEFLATED, SMALLEST = 1032, 2  # largest ratio of inflated to deflated bytes, bytes of a number
+TWICE = 2 * 4  # bytes of a number: the library's copy and the array here
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def write(path: Path, parts: Sequence[Part]) -> None:
 
 def read(path: Path) -> list[Part]:
     """Read a file that `write` made. Raises InputError if it is missing, cut short, altered or another kind of EXR."""
-    parts = [_checked(path, name, channels, attribute) for name, channels, attribute in _open(path)]
+    parts = [_checked(path, part) for part in _parts(path, TWICE)]
     expected = parts[0].record.get("parts") if parts else "1 or more"
     if len(parts) != expected:
         raise InputError(f"{path}: expected {expected} parts, got {len(parts)}; the file is cut short, make it again")
@@ -92,10 +92,10 @@ def read_first_record(path: Path) -> dict[str, Any]:
 
     Whether the pixels are whole is not checked.
     """
-    parts = _open(path, header_only=True)
+    parts = _parts(path)
     if not parts:
         raise InputError(f"{path}: expected an OpenEXR file that ommatid wrote, got one without parts")
-    return _checked_record(path, parts[0][0], parts[0][2])[0]
+    return _checked_record(path, parts[0])[0]
 
 
 def read_picture(path: Path) -> StoredPicture:
@@ -104,114 +104,81 @@ def read_picture(path: Path) -> StoredPicture:
     Raises InputError for several parts, for deep and subsampled pictures, and for pictures whose display window is not
     the stored one.
     """
-    header = _picture_header(path)
-    stored = [channel.name for channel in header["channels"]]
+    parts = _parts(path)
+    if len(parts) > 1:
+        raise several(path, "parts")
+    stored = [channel.name for channel in parts[0].header["channels"]] if parts else []
     grey, colours = "Y" in stored, {"R", "G", "B"} <= set(stored)
     if grey == colours:
         names = printable(", ".join(stored), longest=100)
         raise InputError(f"{path} has channels {names}; expected Y, or R, G and B, not both")
+    header = parts[0].header
+    if not np.array_equal(header["dataWindow"], header["displayWindow"]):
+        raise InputError(
+            f"{path}: expected a picture that is stored whole, got a display window and a data window that differ;"
+            " save it with equal windows"
+        )
     used = [*("Y" if grey else "RGB"), *("A" if "A" in stored else "")]
-    channels = _parts(path)[0].channels
-    pixels = [np.asarray(channels[name].pixels) for name in used]
-    rows, columns = _extent(header["dataWindow"])
-    if any(values.shape != (rows, columns) for values in pixels):
+    channels = {name: channel for part in _parts(path, BYTES) for name, channel in part.channels.items()}
+    pixels = [np.asarray(channels[name].pixels) for name in used if name in channels]
+    rows, columns = _extent(header)
+    if [values.shape for values in pixels] != [(rows, columns)] * len(used):
         raise InputError(f"{path}: expected {rows} x {columns} values of every channel, got fewer; make the file again")
     unused = printable(", ".join(name for name in stored if name not in used), longest=100)
     notes = (f"has channels that are not used: {unused}",) if unused else ()
     return StoredPicture(pixels[0] if len(pixels) == 1 else np.stack(pixels, axis=-1), notes=notes)
 
 
-def _picture_header(path: Path) -> dict[str, Any]:
-    """Return the header of a picture, from which all that is not read is refused before pixels are."""
-    check_regular(path)
-    parts = _parts(path, header_only=True)
-    check_single(path, len(parts), "parts")
-    if not parts or not parts[0].header["channels"]:
-        raise InputError(f"{path}: expected an OpenEXR picture, got a file without complete channels")
-    header: dict[str, Any] = parts[0].header
-    if "deep" in str(header.get("type")):
-        raise InputError(f"{path}: expected one value per pixel and channel, got a deep picture; save it flat")
-    stored, shown = header["dataWindow"], header["displayWindow"]
-    if not np.array_equal(stored, shown):
-        sizes = " and ".join("{} x {}".format(*_extent(window)) for window in (shown, stored))
-        raise InputError(
-            f"{path}: expected a picture that is stored whole, got a display window and a data window ({sizes}) that"
-            " differ; save it with equal windows"
-        )
-    rows, columns = _extent(stored)
-    check_size(path, rows * columns * len(header["channels"]))
-    least = rows * columns * SMALLEST * len(header["channels"])
-    if str(header.get("compression")).rpartition(".")[2] in BOUNDED and least > MOST_DEFLATED * path.stat().st_size:
-        raise InputError(f"{path}: expected {rows} x {columns} pixels, got fewer; the file is cut short")
-    return header
-
-
-def _extent(window: Any) -> tuple[int, int]:
-    """Rows and columns of a window of a header."""
-    (left, top), (right, bottom) = ((int(corner[0]), int(corner[1])) for corner in window)
+def _extent(header: Any) -> tuple[int, int]:
+    """Rows and columns that a header states."""
+    (left, top), (right, bottom) = ((int(corner[0]), int(corner[1])) for corner in header["dataWindow"])
     return bottom - top + 1, right - left + 1
 
 
-def _parts(path: Path, header_only: bool = False) -> list[Any]:
-    """Parts of a file as the library reads them. Raises InputError if it cannot."""
+def _parts(path: Path, bytes_each: int = 0) -> list[Any]:
+    """Parts of a file as the library reads them; headers alone unless `bytes_each`, of memory per number, is given.
+
+    Raises InputError for a file that the library cannot read, a deep one, and one that does not fit into memory.
+    """
     import OpenEXR
 
-    with _readable(path), _silenced():
-        return list(OpenEXR.File(str(path), separate_channels=True, header_only=header_only).parts)
-
-
-@contextmanager
-def _readable(path: Path) -> Generator[None]:
-    """Convert what the library raises for a damaged file to InputError."""
     try:
-        yield
+        check_regular(path)
+        with _silenced():
+            parts = list(OpenEXR.File(str(path), separate_channels=True, header_only=True).parts)
+        if any("deep" in str(part.header.get("type")) for part in parts):
+            raise InputError(f"{path}: expected one value per pixel and channel, got a deep picture; save it flat")
+        if not bytes_each:
+            return parts
+        numbers = sum(prod(_extent(part.header)) * len(part.header["channels"]) for part in parts)
+        check_memory(bytes_each * numbers, f"{path}: to read it", "take a smaller one, or free some memory")
+        with _silenced():
+            return list(OpenEXR.File(str(path), separate_channels=True).parts)
     except InputError:
         raise
-    except (RuntimeError, ValueError, TypeError, KeyError, IndexError) as error:
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except Exception as error:  # the library has many for damaged files
         raise InputError(
             f"{path}: expected an OpenEXR file, got one that cannot be read ({printable(error, longest=100)})"
         ) from error
 
 
-def _open(path: Path, header_only: bool = False) -> list[tuple[str, dict[str, NDArray[np.float32]], str | None]]:
-    """Name, channels and JSON attribute of each part. Raises InputError if the file cannot be read."""
+def _checked(path: Path, part: Any) -> Part:
+    name = str(part.header.get("name", ""))
+    record, seal = _checked_record(path, part)
     try:
-        check_regular(path)
-    except OSError as error:
-        raise InputError(f"{path}: no such file") from error
-    if not header_only:
-        check_memory(_declared_size(path), f"{path}: to read it", "take a smaller one, or free some memory")
-    with _readable(path):
-        return [
-            (
-                str(part.header.get("name", "")),
-                {}
-                if header_only
-                else {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()},
-                part.header.get(ATTRIBUTE),
-            )
-            for part in _parts(path, header_only)
-        ]
-
-
-def _declared_size(path: Path) -> int:
-    """Bytes of all channels by the headers, twice: for the library's copy and for the arrays here."""
-    total = 0
-    for part in _parts(path, header_only=True):
-        rows, columns = _extent(part.header["dataWindow"])
-        total += 2 * 4 * rows * columns * len(part.header["channels"])
-    return total
-
-
-def _checked(path: Path, name: str, channels: dict[str, NDArray[np.float32]], attribute: str | None) -> Part:
-    record, pixels = _checked_record(path, name, attribute)
-    if not channels or _seal(channels) != pixels:
+        channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()}
+    except (ValueError, TypeError) as error:
+        raise InputError(_altered(path, name)) from error
+    if not channels or _seal(channels) != seal:
         raise InputError(_altered(path, name))
     return Part(name, channels, record)
 
 
-def _checked_record(path: Path, name: str, attribute: str | None) -> tuple[dict[str, Any], str]:
+def _checked_record(path: Path, part: Any) -> tuple[dict[str, Any], str]:
     """Return the record of a part and the SHA-256 of its pixels."""
+    name, attribute = part.header.get("name", ""), part.header.get(ATTRIBUTE)
     where = f"{path}: part '{name}'"
     if not isinstance(attribute, str):
         raise InputError(f"{where} has no attribute '{ATTRIBUTE}'; expected a file that ommatid wrote")

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError, naming_source
-from ommatid.runtime.input_files import check_regular
 from ommatid.runtime.machine import check_memory
 from ommatid.runtime.printable import printable
 
@@ -202,28 +201,13 @@ def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
 
 def _stored(image: str, where: str) -> StoredPicture:
     """Read the picture that `target.image` names, without scaling."""
-    return read_picture(_picture_path(image, where), where)
+    name = image.removeprefix("photo:")
+    return read_picture(Path(image) if name == image else _photo_path(name, where), where)
 
 
 def _step(bits: int) -> float:
     """Grey levels per value of a PNG file with fewer than 8 bits."""
     return WHITE / (2**bits - 1)
-
-
-def _picture_path(image: str, where: str) -> Path:
-    """Return the file of a picture. Raises InputError if there is none."""
-    if image.startswith("photo:"):
-        return _photo_path(image.removeprefix("photo:"), where)
-    path = Path(image)
-    try:
-        check_regular(path)
-    except InputError as error:
-        raise InputError(f"{where}: {error}; name a PNG, TIFF, EXR or NPY file") from error
-    except (OSError, ValueError) as error:  # ValueError for a name with a null
-        raise InputError(
-            f"{where}: there is no picture {printable(path)}; name a PNG, TIFF, EXR or NPY file, or photo:camera"
-        ) from error
-    return path
 
 
 def _photo_path(name: str, where: str) -> Path:

@@ -57,17 +57,16 @@ def _read(path: Path, where: str, readers: Mapping[str, Reader], most: int | Non
         with warnings.catch_warnings(action="ignore"), open_input(path) as stream:
             size = os.fstat(stream.fileno()).st_size
             check_memory(2 * size, f"{path}: to read it", "take a smaller file, or free some memory")
-            return list(islice(reader(stream, path), most))
+            pictures = list(islice(reader(stream, path), most))
+        if not pictures:
+            raise ValueError("it holds none")
+        return pictures
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
-    except FileNotFoundError as error:
-        raise InputError(f"{where}: there is no file {path}") from error
-    except PermissionError as error:
-        raise InputError(f"{where}: {path} could not be opened; permit reading it") from error
     except Exception as error:  # every decoder has exceptions of its own
-        reason = shortened(str(error)) or type(error).__name__
+        reason = shortened((isinstance(error, OSError) and error.strerror) or str(error)) or type(error).__name__
         raise InputError(
-            f"{where}: {path} could not be read as a picture ({reason}); it is damaged or another kind of file"
+            f"{where}: {path} could not be read as a picture ({reason}); name a sound PNG, TIFF, EXR or NPY file"
         ) from error
 
 

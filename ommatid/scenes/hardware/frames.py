@@ -21,20 +21,18 @@ import numpy as np
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import file_digest, fingerprint
-from ommatid.runtime.input_files import check_regular
 from ommatid.runtime.versions import versions
 
 from ..camera import Camera
 from ..constants import WHITE
 from ..formats.picture import grey, notes_of
-from ..formats.picture_file import read_frames_of
+from ..formats.picture_file import FRAMES, read_frames_of
 from ..formats.stored_picture import StoredPicture
 from ..recording import Recording
 from ..setup import Setup
 from ..stack import Stack
 from ..tables.sensor import SensorTable
 
-SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy")
 FLOATING = "floating-point"
 
 
@@ -70,7 +68,7 @@ def files_in(path: Path) -> list[Path]:
     """The file itself, or the pictures in a folder sorted by name. Raises InputError if there is none."""
     if not path.is_dir():
         return [path]
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in FRAMES and not file.name.startswith("."))
     if not files:
         raise InputError(f"{path}: expected a folder of PNG, TIFF, EXR or NPY files, got none of them in it")
     return files
@@ -81,20 +79,12 @@ def stored_pictures(path: Path, what: str) -> list[StoredPicture]:
 
     Raises InputError if there is none.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: expected {what} as PNG, TIFF, EXR or NPY files, whose numbers are the sensor's")
-    try:
-        check_regular(path)
-    except OSError as error:
-        raise InputError(f"{path}: there is no such file among the {what}") from error
     pictures = read_frames_of(path, what)
     for stored in pictures:
         if stored.pixels.dtype.kind not in "uif":
             raise InputError(
                 f"{path}: expected whole or floating-point numbers, got {stored.pixels.dtype}, {stored.pixels.shape}"
             )
-    if not pictures:
-        raise InputError(f"{path}: expected {what}, got a file without pictures")
     return pictures
 
 

@@ -93,14 +93,6 @@ def parse_json(text: str | bytes) -> Any:
     return json.loads(text, object_pairs_hook=_table)
 
 
-def check_unique_keys(path: Path, content: bytes) -> None:
-    """Raise InputError if a JSON document, which has been read, has a key twice in one table."""
-    try:
-        json.loads(content, object_pairs_hook=_table, parse_int=len, parse_float=len)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: {error}; delete it and make it again") from error
-
-
 def read_record(path: Path, kind: Any, what: str, cure: str, *, strict: bool = False) -> Any:
     """Read a JSON file of records that this program wrote. Raises InputError with what was expected, and the cure.
 
@@ -111,14 +103,18 @@ def read_record(path: Path, kind: Any, what: str, cure: str, *, strict: bool = F
     try:
         content = read_bytes(path)
         record = TypeAdapter(kind).validate_json(content, strict=strict)
+        parse_json(content)
+        return record
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{path}: expected {what}, got no file that can be read ({error.strerror}); {cure}") from error
     except ValidationError as error:
         first = error.errors()[0]
         key, reason = shortened(".".join(map(str, first["loc"]))) or "content", shortened(first["msg"])
         raise InputError(f"{path}: expected {what}, got a file whose {key} is wrong: {reason}; {cure}") from error
-    check_unique_keys(path, content)
-    return record
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: {error}; {cure}") from error
 
 
 def real_path(path: Path) -> Path:

@@ -7,11 +7,12 @@ import os
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.input_files import check_unique_keys, open_input, parse_json, read_bytes, read_text
+from ommatid.runtime.input_files import open_input, parse_json, read_bytes, read_record, read_text
 
 from ..modules import modules
 
@@ -90,8 +91,9 @@ def test_a_key_that_stands_twice_is_refused() -> None:
     document = '[{"c": 1}, {"b": {"c": 1.5, "d": 2, "c": 1e400}}]'
     with pytest.raises(ValueError, match="expected each key of a table once, got 'c' twice"):
         parse_json(document)
+    Path("run.json").write_text(document, encoding="utf-8")
     with pytest.raises(InputError, match=r"^run\.json: expected each key of a table once, got 'c' twice; delete it"):
-        check_unique_keys(Path("run.json"), document.encode())
+        read_record(Path("run.json"), list[Any], "a list", "delete it")
 
 
 def test_a_refused_input_does_not_stay_open(tmp_path: Path) -> None:

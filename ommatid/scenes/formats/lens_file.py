@@ -88,13 +88,13 @@ def _with_glass(surface: Surface, catalogue: Catalogue | None, where: str) -> Su
         return surface
     name = glass.ALIASES.get(surface.glass, surface.glass)
     if catalogue is not None:
-        found = catalogue.find(surface.glass)
+        found = glass.spelling(surface.glass, catalogue.entries)
         if found is not None:
             return surface.model_copy(update={"glass": found, "dispersion": catalogue.dispersion(found)})
     try:
         glass.check(name)
     except InputError as error:
-        nearest = catalogue and catalogue.nearest(surface.glass)
+        nearest = catalogue and glass.nearest(surface.glass, catalogue.entries)
         advice = f"; the catalogue's nearest glass is '{shortened(nearest)}'" if nearest else ""
         raise InputError(f"{where}: {error}{advice}") from error
     return surface.model_copy(update={"glass": name})

@@ -18,7 +18,6 @@ several decades wrote them.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import inf
@@ -53,19 +52,6 @@ class Catalogue:
 
     path: Path
     entries: dict[str, tuple[int, dict[str, list[str]]]]
-
-    def find(self, name: str) -> str | None:
-        """Return the catalogue's own spelling of a name, None if it has no such glass."""
-        if name in self.entries:
-            return name
-        folded = {other.casefold(): other for other in reversed(self.entries)}
-        return folded.get(name.casefold())
-
-    def nearest(self, name: str) -> str | None:
-        """Return the name of a glass of the catalogue that resembles `name`, None if none does."""
-        folded = {other.casefold(): other for other in reversed(self.entries)}
-        near = difflib.get_close_matches(name.casefold()[:80], folded, n=1)
-        return folded[near[0]] if near else None
 
     def dispersion(self, name: str) -> Dispersion:
         """Return the dispersion of a glass of the catalogue. Raises InputError for a damaged entry."""

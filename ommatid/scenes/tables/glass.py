@@ -13,6 +13,7 @@ come from a catalogue, whose dispersion a surface then holds.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable
 
 from ommatid.runtime.errors import InputError, shortened
 
@@ -70,12 +71,24 @@ def index_behind(surface: Surface, wavelength: float = GREEN) -> float:
     return surface.index or index(surface.glass or AIR, wavelength)
 
 
+def spelling(name: str, known: Iterable[str]) -> str | None:
+    """Return a name as it is known, itself or else in other cases of its letters; None if it is not."""
+    names = list(known)
+    return name if name in names else next((other for other in names if other.casefold() == name.casefold()), None)
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name that resembles a name most, None if none does."""
+    folded = {other.casefold(): other for other in reversed(list(known))}
+    near = difflib.get_close_matches(name.casefold()[:80], folded, n=1)
+    return folded[near[0]] if near else None
+
+
 def check(name: str) -> None:
     """Raise InputError, with the nearest known name, unless the glass is built in."""
     known = [AIR, *GLASSES]
     if name in known:
         return
-    folded = {other.casefold(): other for other in known}
-    near = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=0.4)
-    advice = f"did you mean '{folded[near[0]]}'?" if near else "name its catalogue as camera.glass_catalogue"
+    near = nearest(name, known)
+    advice = f"did you mean '{near}'?" if near else "name its catalogue as camera.glass_catalogue"
     raise InputError(f"expected a glass among {', '.join(known)}, got '{shortened(name)}'; {advice}")

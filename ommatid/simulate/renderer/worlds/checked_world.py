@@ -11,7 +11,6 @@ import io
 import re
 from dataclasses import dataclass, field
 from functools import cache
-from math import inf
 from pathlib import Path
 from typing import Any
 from xml.sax import SAXParseException, handler
@@ -24,14 +23,12 @@ from ommatid.runtime.printable import printable
 from ..variant import mitsuba_folder
 
 SHOWN = 80  # characters of a name in messages
-LARGEST = {"spectrum": 64_000_000, "regular": 64_000_000, "irregular": 64_000_000}  # bytes of files of spectra
 DEEPEST_INCLUDE, MOST_INCLUDES = 15, 1000  # the former as in Mitsuba
 LONGEST_REASON = 180  # characters
 VERSION_OF_NAMES = 2  # from which Mitsuba's properties have today's names
 DEEPEST = 64  # levels of nested elements; Mitsuba and its plugins recurse into them
 MOST_ELEMENTS = 300_000  # of a world, those of included files counted as often as they are included
 LIBRARIES = (".so", ".dylib", ".dll")
-METAL = ".eta.spd"
 
 
 @dataclass(frozen=True)
@@ -224,16 +221,11 @@ class _Expansion:
             key = "value"
         elif tag == "spectrum" and "filename" in attributes:
             key, plugin = "filename", "spectrum"
-        elif tag == "string" and name == "material" and value not in metals():
-            raise InputError(f"{place}: expected a material that Mitsuba ships, got '{printable(value, SHOWN)}'")
         elif tag == "string" and ("/" in value or "\\" in value):
             named = printable(f"{name} = {value}", SHOWN)
             raise InputError(f"{place}: expected files in 'filename' alone, got the path {named}")
         if key is not None:
             path = self._found(attributes[key], place)
-            if path.stat().st_size > LARGEST.get(plugin, inf):
-                largest = LARGEST[plugin] / 1e6
-                raise InputError(f"{place}: {printable(path)}: expected at most {largest:g} MB; shorten it")
             self.files[path] = None
             self.checked[path] = plugin
             attributes[key] = str(path.resolve())
@@ -347,10 +339,3 @@ def read_xml(path: Path) -> WorldElement:
 def plugin_names() -> frozenset[str]:
     """Return the names of Mitsuba's plugins."""
     return frozenset(path.stem for path in (mitsuba_folder() / "plugins").iterdir() if path.suffix in LIBRARIES)
-
-
-@cache
-def metals() -> frozenset[str]:
-    """Return the materials whose optical constants Mitsuba ships."""
-    found = (mitsuba_folder() / "data" / "ior").glob(f"*{METAL}")
-    return frozenset({"none", *(path.name.removesuffix(METAL) for path in found)})

@@ -25,7 +25,7 @@ from ..tables import glass, toml
 from ..tables.camera import MOST_SURFACES, SURFACES, CameraTable, Surface
 from ..tables.messages import validated
 from ..tables.table import Table
-from .zemax import Catalogue, number, read_catalogue, read_zmx
+from .zemax import Catalogue, number, read_catalogue, read_zmx, surface_of
 
 LARGEST = 10**6  # bytes
 COLUMNS = "radius, thickness, index of refraction, diameter"
@@ -133,18 +133,6 @@ def _from_rows(text: str, path: Path) -> tuple[Surface, ...]:
 
 def _surface(values: list[float], before: float, *, last: bool, where: str) -> Surface:
     radius, thickness, index, diameter = values
-    if thickness < 0:
-        raise InputError(f"{where}: expected a thickness of 0 mm or more, got {thickness:g}")
-    if index and not 1 <= index <= 5:
-        raise InputError(f"{where}: expected an index of refraction from 1 to 5, or 0 for air, got {index:g}")
-    if diameter <= 0:
-        raise InputError(f"{where}: expected a diameter above 0 mm, got {diameter:g}")
-    table: dict[str, Any] = {"semi_diameter": f"{diameter / 2!r} mm"}
-    if radius:
-        table["radius"] = f"{radius!r} mm"
-    if thickness and not last:
-        table["thickness"] = f"{thickness!r} mm"
-    if index > 1:
-        table["index"] = index
-    table["stop"] = radius == 0 and (index == 0 or index == before == 1)
-    return validated(Surface, table, where)
+    lengths = {"radius": radius, "thickness": 0.0 if last else thickness, "semi_diameter": diameter / 2}
+    table: dict[str, Any] = {} if index in (0, 1) else {"index": index}
+    return surface_of(lengths, table | {"stop": radius == 0 and (index == 0 or index == before == 1)}, where)

@@ -124,24 +124,23 @@ def read_zmx(path: Path) -> tuple[Surface, ...]:
     unit, surfaces = _surfaces(read_any_text(path, "lens file", LARGEST), path)
     if len(surfaces) < 3:
         raise InputError(f"{path}: expected surfaces between the object and the image (SURF), got none")
-    read: list[dict[str, Any]] = []
+    read: list[tuple[dict[str, float], dict[str, Any], str]] = []
     before: object = None
     for place, lines in enumerate(surfaces[1:-1], start=1):
         where = f"{path}, line {lines.line}, surface {place}"
-        table = _table(lines, where, unit)
-        thickness = lines.value("DISZ", where) * unit
+        lengths, table = _surface(lines, where, unit)
         behind = table.get("glass") or table.get("dispersion") or table.get("index")  # None for air
-        is_flat = not {"radius", "aspheric"} & {*table}
+        is_flat = not lengths["radius"] and "aspheric" not in table
         if before is None and behind is None and not table["stop"] and is_flat:  # it does nothing
             if read:
-                read[-1]["thickness"] += thickness
+                read[-1][0]["thickness"] += lengths["thickness"]
         else:
-            read.append(table | {"thickness": thickness, "where": where})
+            read.append((lengths, table, where))
         before = behind
     if not read:
         raise InputError(f"{path}: expected a lens, got flat surfaces without glass alone")
-    read[-1]["thickness"] = 0.0
-    return tuple(_surface(table) for table in read)
+    read[-1][0]["thickness"] = 0.0
+    return tuple(surface_of(lengths, table, where) for lengths, table, where in read)
 
 
 def _surfaces(text: str, path: Path) -> tuple[float, list[Lines]]:
@@ -173,8 +172,8 @@ def _keywords(text: str) -> Iterator[tuple[int, str, list[str]]]:
             yield line, words[0].upper(), words[1:]
 
 
-def _table(lines: Lines, where: str, unit: float) -> dict[str, Any]:
-    """Return the keys of a surface of a scene file, its lengths as numbers of mm; raise InputError if unsupported."""
+def _surface(lines: Lines, where: str, unit: float) -> tuple[dict[str, float], dict[str, Any]]:
+    """Return the lengths of a surface in mm, and its other keys of a scene file; raise InputError if unsupported."""
     for keyword, meaning in REFUSED.items():
         if keyword in lines.words:
             raise InputError(f"{where}: expected a circular opening, got {meaning} ({keyword}); remove it")
@@ -184,16 +183,14 @@ def _table(lines: Lines, where: str, unit: float) -> dict[str, Any]:
         raise InputError(f"{where}: expected a surface of type {' or '.join(KINDS)} on one axis, got {what}")
     curvature = lines.value("CURV", where) / unit
     table: dict[str, Any] = {"conic": lines.value("CONI", where), "stop": "STOP" in lines.words}
-    table["semi_diameter"] = _opening(lines, where) * unit
     if kind == ASPHERE:
         terms = [lines.value(f"PARM {n}", where) / unit ** (2 * n - 1) for n in range(1, TERMS + 1)]
         if terms[0]:
             curvature, table["conic"] = _with_square(curvature, table["conic"], terms[0], where)
         if any(terms[1:]):
             table["aspheric"] = terms[1:]
-    if curvature:
-        table["radius"] = 1 / curvature
-    return table | _glass(lines, where)
+    lengths = {"radius": 1 / curvature if curvature else 0.0, "thickness": lines.value("DISZ", where) * unit}
+    return lengths | {"semi_diameter": _opening(lines, where) * unit}, table | _glass(lines, where)
 
 
 def _with_square(curvature: float, conic: float, term: float, where: str) -> tuple[float, float]:
@@ -234,8 +231,6 @@ def _glass(lines: Lines, where: str) -> dict[str, Any]:
 def _model_glass(words: list[str], where: str) -> dict[str, Any]:
     """Return the keys of a glass without a name, of which nd and vd are given; a vd of 0 is no dispersion."""
     index, abbe = (number(word, where, "nd and vd of a glass") for word in (*words, "", "")[:2])
-    if not 1 <= index <= 5:
-        raise InputError(f"{where}: expected a glass of nd from 1 to 5, got {index:g}")
     if abbe and not LEAST_ABBE <= abbe <= LARGEST_ABBE:
         raise InputError(
             f"{where}: expected a glass of vd 0 or from {LEAST_ABBE} to {LARGEST_ABBE}, got {abbe:g}; give its name"
@@ -250,12 +245,7 @@ def _model_glass(words: list[str], where: str) -> dict[str, Any]:
     return {"dispersion": {"formula": 1, "coefficients": coefficients, "shortest": "400 nm", "longest": "700 nm"}}
 
 
-def _surface(table: dict[str, Any]) -> Surface:
-    where, thickness = table.pop("where"), table.pop("thickness")
-    if not 0 <= thickness < inf:
-        raise InputError(f"{where}: expected a finite thickness (DISZ) of 0 or more, got {thickness:g} mm")
-    if table["semi_diameter"] <= 0:
-        raise InputError(f"{where}: expected a semi-diameter (DIAM) above 0, got {table['semi_diameter']:g} mm")
-    lengths = {"thickness": thickness, "semi_diameter": table["semi_diameter"], "radius": table.get("radius", 0.0)}
-    data = table | {name: f"{value!r} mm" for name, value in lengths.items() if value}
-    return validated(Surface, data, where)
+def surface_of(lengths: dict[str, float], table: dict[str, Any], where: str) -> Surface:
+    """Return a surface from its lengths in mm, of which 0 is none, and its other keys. Raises InputError."""
+    stated = {name: f"{length!r} mm" for name, length in lengths.items() if length}
+    return validated(Surface, table | stated, where)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.input_files import check_regular, open_input
+from ommatid.runtime.input_files import open_input
 from ommatid.runtime.machine import check_memory
 
 FASTEST = 1  # level of compression: entries of H take as many bytes as at level 6
@@ -65,7 +65,9 @@ def write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def array(path: Path) -> NDArray[Any]:
     """Read an NPY file. Raises ValueError that says why it cannot be read, InputError if memory is too small."""
     with _readable():
-        check_regular(path)
+        with open_input(path) as stream:
+            if np.lib.format.read_magic(stream) != (1, 0):  # others may have headers of any length
+                raise ValueError("expected version 1.0 of the format, as numpy writes numbers")
         check_memory(3 * path.stat().st_size, f"{path}: to read it", "take a smaller one, or free some memory")
         return np.array(np.lib.format.open_memmap(path, mode="r"))  # which is refused if the file is too short for it
 

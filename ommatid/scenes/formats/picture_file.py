@@ -85,7 +85,8 @@ def _png(stream: BinaryIO, path: Path) -> Iterator[StoredPicture]:
         if described.n_frames - bool(described.default_image) > 1:
             raise several(path, "frames")
         is_palette = opened.mode == "P"
-        check_size(path, prod(opened.size) * (MOST_COLOURS if is_palette else len(opened.getbands()) + 1))
+        channels = MOST_COLOURS if is_palette else len(opened.getbands()) + ("transparency" in info)
+        check_size(path, prod(opened.size) * channels)
         opened.load()  # what stands behind the pixels, too
         orientation = _orientation(opened)
     pixels = np.asarray(cast(Any, imagecodecs).png_decode(data))

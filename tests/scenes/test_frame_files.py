@@ -12,22 +12,12 @@ import tifffile
 from ommatid.pipeline.camera_files import import_file
 from ommatid.runtime.errors import InputError
 from ommatid.scenes import stack
-from ommatid.scenes.formats.picture import LUMINANCE, grey
 from ommatid.scenes.hardware.frames import AcquisitionSettings, FrameNotes, stored_pictures
 
 from . import picture_bytes as made
 from .mosaics import SCENE, SHAPE
 
 RNG = np.random.default_rng(19)
-
-
-@pytest.mark.parametrize(("colour", "bits"), [kind for kind in made.KINDS if kind[0] in (0, 2)])
-def test_numbers_of_a_png_are_those_of_the_sensor(colour: int, bits: int, tmp_path: Path) -> None:
-    counts = RNG.integers(0, 2**bits, (14, 15, made.SAMPLES[colour]))
-    (tmp_path / "a.png").write_bytes(made.png(counts, colour, bits))
-    frame = stored_pictures(tmp_path / "a.png", "images")[0].pixels
-    expected = counts[..., 0] if colour == 0 else counts @ np.array(LUMINANCE)
-    np.testing.assert_allclose(grey(frame, "here"), expected, rtol=1e-12)
 
 
 def test_every_page_is_a_frame_and_is_turned_by_its_own_orientation(tmp_path: Path) -> None:

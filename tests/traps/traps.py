@@ -13,7 +13,7 @@ MODULES = (
     "matplotlib", "typing", "pickle", "sitecustomize", "usercustomize", "conftest", "__init__", "setup", "noxfile",
     "__main__", "random", "struct", "tempfile", "socket", "psutil", "typer", "rich", "pydantic", "tifffile",
     "OpenEXR", "tomllib", "evil", "threading", "_bootlocale", "readline", "zlib", "dask", "distributed", "skimage",
-    "PIL", "defusedxml",
+    "PIL", "pyexpat",
 )  # fmt: skip
 PACKAGES = ("encodings", "importlib", "multiprocessing", "plugins", "yaml")
 LIBRARIES = (

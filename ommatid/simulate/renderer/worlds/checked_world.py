@@ -1,19 +1,19 @@
 """Mitsuba scene files, checked without Mitsuba: their XML, plugins, and the files that they name.
 
-XML is read with limits; document types and entities are refused, so that a file cannot grow or name other files while
-it is parsed. `check_world_files` writes one text out of a file and those that it includes: variables are replaced,
-paths are absolute, and no element is left that names further XML. This text, and nothing else, is what Mitsuba parses.
+XML is read with limits; document types, and thus entities, are refused, so that a file cannot grow or name other files
+while it is parsed. `check_world_files` writes one text out of a file and those that it includes: variables are
+replaced, paths are absolute, and no element is left that names further XML. This text, and nothing else, is what
+Mitsuba parses.
 """
 
 from __future__ import annotations
 
-import io
 import re
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import count
 from pathlib import Path
-from typing import Any
-from xml.sax import SAXParseException, handler
+from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from ommatid.runtime.errors import InputError
@@ -277,62 +277,31 @@ class WorldElement:
     children: list[WorldElement] = field(default_factory=lambda: list[WorldElement]())
 
 
-class _TreeBuilder(handler.ContentHandler):
-    """Builds the elements of a file and stops at its limits."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.root: WorldElement | None = None
-        self._open: list[WorldElement] = []
-        self._count = 0
-        self._where: Any = None
-
-    @property
-    def line(self) -> int:
-        return int(self._where.getLineNumber() or 0)
-
-    def setDocumentLocator(self, locator: Any) -> None:
-        self._where = locator
-
-    def startElement(self, name: str, attrs: Any) -> None:
-        element = WorldElement(name, dict(attrs.items()), self.line)
-        self._count += 1
-        if len(self._open) >= DEEPEST:
-            raise InputError(f"elements are nested in more than {DEEPEST} levels; expected at most {DEEPEST}")
-        if self._count > MOST_ELEMENTS:
-            raise InputError(f"there are more than {MOST_ELEMENTS} elements; expected fewer")
-        if self._open:
-            self._open[-1].children.append(element)
-        else:
-            self.root = element
-        self._open.append(element)
-
-    def endElement(self, name: str) -> None:
-        del name
-        self._open.pop()
-
-
 def read_xml(path: Path) -> WorldElement:
     """Read the elements of a Mitsuba file. Raises InputError that does not name the file, OSError if it is missing."""
-    from defusedxml.common import DefusedXmlException
-    from defusedxml.sax import parse
+    parser, within, root, elements = expat.ParserCreate(), list[WorldElement](), list[WorldElement](), count(1)
 
-    content = io.BytesIO(read_bytes(path, LARGEST_TEXT))
-    tree = _TreeBuilder()
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if next(elements) > MOST_ELEMENTS:
+            raise InputError(f"there are more than {MOST_ELEMENTS} elements; expected fewer")
+        element = WorldElement(tag, attributes, parser.CurrentLineNumber)
+        (within[-1].children if within else root).append(element)
+        within.append(element)
+
+    def end(_: str) -> None:
+        within.pop()
+
+    def refuse(*_: object) -> None:
+        raise InputError("has a document type or entities (<!DOCTYPE>); remove them")
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
     try:
-        parse(content, tree, handler.ErrorHandler(), forbid_dtd=True)
-    except DefusedXmlException as error:
-        raise InputError("has a document type or entities (<!DOCTYPE>); remove them") from error
-    except SAXParseException as error:
-        line, reason = error.getLineNumber(), printable(error.getMessage(), SHOWN)
-        raise InputError(f"is not valid XML (line {line}): {reason}; correct it there") from error
-    except (ValueError, LookupError) as error:
-        if isinstance(error, InputError):
-            raise InputError(f"line {tree.line}: {error}") from error
+        parser.Parse(read_bytes(path, LARGEST_TEXT), True)
+    except InputError:
+        raise
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the latter for unknown encodings
         raise InputError(f"is not valid XML: {printable(error, SHOWN)}; correct it there") from error
-    if tree.root is None:
-        raise InputError("is not valid XML: no element found; correct it there")
-    return tree.root
+    return root[0]
 
 
 @cache

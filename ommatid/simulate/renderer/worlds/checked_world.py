@@ -25,7 +25,6 @@ from ..variant import mitsuba_folder
 SHOWN = 80  # characters of a name in messages
 DEEPEST_INCLUDE, MOST_INCLUDES = 15, 1000  # the former as in Mitsuba
 LONGEST_REASON = 180  # characters
-VERSION_OF_NAMES = 2  # from which Mitsuba's properties have today's names
 DEEPEST = 64  # levels of nested elements; Mitsuba and its plugins recurse into them
 MOST_ELEMENTS = 300_000  # of a world, those of included files counted as often as they are included
 LIBRARIES = (".so", ".dylib", ".dll")
@@ -114,7 +113,6 @@ class _Expansion:
         self._searched = [path.parent]
         self._variables: dict[str, str] = {}
         self._size = self._includes = 0
-        self._old_names: bool | None = None  # of the first file; the text has one version
         self._elements: dict[Path, WorldElement] = {}
 
     def include(self, path: Path, including: list[Path], name: str | None = None) -> None:
@@ -127,11 +125,8 @@ class _Expansion:
         except InputError as error:
             raise InputError(str(error) if str(path) in str(error) else f"{shown}: {error}") from error
         root, depth = self._elements[path], len(including)
-        if "version" not in root.attributes:
-            raise InputError(f"{shown}: expected <{printable(root.tag, SHOWN)} version='3.0.0'>, got no version")
         if not including and root.tag != "scene":
             raise InputError(f"{shown} holds a single {printable(root.tag, SHOWN)}; expected a whole <scene>")
-        self._check_version(root, shown)
         levels = depth + 1
         if root.tag == "scene" and including:
             for child in root.children:
@@ -141,15 +136,6 @@ class _Expansion:
             kept = {key: value for key, value in root.attributes.items() if key not in ("version", "name")}
             root = WorldElement(root.tag, kept | ({} if name is None else {"name": name}), root.line, root.children)
         self._write(root, None, [*including, path], levels)
-
-    def _check_version(self, root: WorldElement, shown: str) -> None:
-        version = root.attributes["version"]
-        if not re.fullmatch(r"\d{1,9}\.\d{1,9}\.\d{1,9}", version, re.ASCII):
-            raise InputError(f"{shown}: expected a version such as 3.0.0, got '{printable(version, SHOWN)}'")
-        old = int(version.partition(".")[0]) < VERSION_OF_NAMES
-        if self._old_names is not None and old != self._old_names:
-            raise InputError(f"{shown}: expected the version of the including file, got {printable(version, SHOWN)}")
-        self._old_names = old
 
     def _write(self, element: WorldElement, parent: WorldElement | None, files: list[Path], levels: int) -> None:
         path, place = files[-1], f"{printable(files[-1])} (line {element.line})"

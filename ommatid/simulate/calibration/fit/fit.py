@@ -24,7 +24,7 @@ from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import MeasuredRows
 
 from ..responses import Responses, Subsets
-from .chart import ChartRows, Explanation, chart_of, chart_rows, freedom_of, side_for_kernels
+from .chart import SIDE, ChartRows, Explanation, chart_of, chart_rows, freedom_of, side_for_kernels
 from .view_fit import SIGNIFICANCE, fit_views, predicted
 
 if TYPE_CHECKING:
@@ -104,13 +104,13 @@ def calibrate_by_fit(
     with_kernels : True if kernels may explain blur
     """
     subsets = first_measured(camera, with_kernels)
-    charted = {name: subset is not None for name, subset in subsets.items()}
     responses = measure(subsets)
     fits = {
-        lens.name: _fit_type(camera, lens, subs, responses, rows, rays[lens.name], charted[lens.name], recorded)
+        lens.name: _fit_type(camera, lens, subs, responses, rows, rays[lens.name], subsets[lens.name], recorded)
         for lens, subs, rows in zip(camera.types, _by_type(camera), camera.type_slices(), strict=True)
     }
-    charted = {lens.name: charted[lens.name] and _chart(camera, lens).size < lens.measurements for lens in camera.types}
+    counts = {lens.name: lens.measurements for lens in camera.types}
+    charted = {name: chart is not None and chart.size < counts[name] for name, chart in subsets.items()}
     unexplained: Subsets = {
         lens.name: chart_of(lens, ~fits[lens.name].views.explained)
         for lens in camera.types
@@ -132,12 +132,10 @@ def calibrate_by_fit(
 
 def first_measured(camera: Camera, with_kernels: bool = True) -> Subsets:
     """Return the pixels of each lens type that are measured first, None for all."""
-    return {lens.name: _chart(camera, lens) if has_chart(camera, lens, with_kernels) else None for lens in camera.types}
-
-
-def _chart(camera: Camera, lens: LensType) -> IntArray:
-    """Return the pixels of a lens type that are measured first: (pixels,)."""
-    return chart_of(lens) if is_sharp(camera, lens) else chart_of(lens, side=side_for_kernels(lens))
+    found: Subsets = dict.fromkeys(lens.name for lens in camera.types)
+    for lens in (lens for lens in camera.types if has_chart(camera, lens, with_kernels)):
+        found[lens.name] = chart_of(lens, side=SIDE if is_sharp(camera, lens) else side_for_kernels(lens))
+    return found
 
 
 def _by_type(camera: Camera) -> list[list[SubImager]]:
@@ -152,15 +150,15 @@ def _fit_type(
     responses: Responses,
     rows: slice,
     rays: int,
-    charted: bool,
+    chart: IntArray | None,
     recorded: bool,
 ) -> _TypeFit:
-    if not charted:
+    if chart is None:
         return _TypeFit(views_as_designed(subs, explained=False))
     if not is_sharp(camera, lens):
         from .kernel_fit import fit_kernels
 
-        kernels = fit_kernels(responses, camera, lens, _chart(camera, lens))
+        kernels = fit_kernels(responses, camera, lens, chart)
         return _TypeFit(views_as_designed(subs, kernels.accepted), kernels=kernels)
     pointers = responses.matrix.indptr
     batches = responses.batches[:, int(pointers[rows.start]) : int(pointers[rows.stop])]

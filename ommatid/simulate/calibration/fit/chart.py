@@ -7,7 +7,7 @@ shift, magnification and rotation fall as 1/n, as fast as with all pixels and mo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -158,9 +158,10 @@ class Explanation:
         return self.left / self.expected - 1 if self.expected else 0.0
 
     @staticmethod
-    def of(products: FloatArray) -> Explanation:
-        """Compare residuals by products of those of the mean and of the batches: (1 + B, 1 + B)."""
-        count, noise = len(products) - 1, products[1:, 1:]
-        return Explanation(
-            float(products[0, 0]), float(np.trace(noise)) / (count * (count - 1)), freedom_of(noise), count
-        )
+    def of(residuals: Iterable[FloatArray], floor: float = 0.0) -> Explanation:
+        """Compare residuals of the mean, the first, with those of the batches; floor : added to the expectation."""
+        flat = np.stack([each.ravel() for each in residuals])
+        products = np.asarray(flat @ flat.T, dtype=np.float64)
+        count, noise = len(flat) - 1, products[1:, 1:]
+        expected = float(np.trace(noise)) / (count * (count - 1)) + floor
+        return Explanation(float(products[0, 0]), expected, min(freedom_of(noise), float(flat.shape[1])), count)

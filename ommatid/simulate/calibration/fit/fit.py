@@ -24,7 +24,7 @@ from ommatid.scenes.lens_type import LensType, SubImager
 from ommatid.scenes.model import MeasuredRows
 
 from ..responses import Responses, Subsets
-from .chart import SIDE, ChartRows, Explanation, chart_of, chart_rows, freedom_of, side_for_kernels
+from .chart import SIDE, ChartRows, Explanation, chart_of, chart_rows, side_for_kernels
 from .view_fit import SIGNIFICANCE, fit_views, predicted
 
 if TYPE_CHECKING:
@@ -42,19 +42,10 @@ def explanation(chart: ChartRows, model: FloatArray, rays: int, recorded: bool =
 
     rays : per pixel, of all passes;  recorded : True for entries with about the same noise, of which some are missing
     """
-    weights = (chart.known.astype(np.float64) if recorded else rays / (model + FEW / rays)).ravel()
-    residual = (chart.values - model).ravel()
-    batches = chart.batches.reshape(len(chart.batches), -1)
-    gram = np.asarray((batches * weights) @ batches.T, dtype=np.float64)
-    count = len(gram)
-    touched = ((model > 0) | (chart.values > 0)).ravel()
-    floor = float(weights[touched].sum()) * (STRAY / rays) ** 2
-    return Explanation(
-        left=float(weights @ np.square(residual)),
-        expected=float(np.trace(gram)) / (count * (count - 1)) + floor,
-        freedom=min(freedom_of(gram), float(residual.size)),
-        batches=count,
-    )
+    weights = chart.known.astype(np.float64) if recorded else rays / (model + FEW / rays)
+    floor = float(weights[(model > 0) | (chart.values > 0)].sum()) * (STRAY / rays) ** 2
+    root = np.sqrt(weights)
+    return Explanation.of([root * each for each in (chart.values - model, *chart.batches)], floor)
 
 
 @dataclass(frozen=True)

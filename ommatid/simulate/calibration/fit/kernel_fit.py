@@ -381,22 +381,16 @@ def _tested(chart: Chart, mean: FloatArray, learnt: bool) -> _Candidate:
         left.append(rest * root)
         for name, of in members.items():
             means[name].append(of @ rest / np.sqrt(np.maximum(of @ chart.inside, 1.0)))
-    tests = {"all cells": _explanation(left)}
+    tests = {"all cells": Explanation.of(left)}
     for name, parts in means.items():
-        tests[name] = _explanation([part * root for part in parts])
-        tests[f"{name} in a picture"] = _explanation([chart.seen(part) for part in parts])
+        tests[name] = Explanation.of([part * root for part in parts])
+        tests[f"{name} in a picture"] = Explanation.of([chart.seen(part) for part in parts])
     return _Candidate(mean[0] if learnt else None, tests)
 
 
 def _members(index: IntArray) -> FloatArray:
     """Return 1 where a pixel is in a group, (groups, pixels)."""
     return (index == np.unique(index)[:, None]).astype(np.float64)
-
-
-def _explanation(residuals: list[FloatArray]) -> Explanation:
-    """Compare the residuals of the mean with those of the batches."""
-    flat = [part.ravel() for part in residuals]
-    return Explanation.of(np.array([[np.dot(a, b) for b in flat] for a in flat], dtype=np.float64))
 
 
 def _directions(chart: Chart, candidate: _Candidate) -> FloatArray:

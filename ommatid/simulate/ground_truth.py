@@ -69,9 +69,11 @@ def _depth(world: Any, camera: Camera) -> FloatArray:
     """Return the depth, (rows, columns), that rays from the array's centre meet; infinite where they meet nothing."""
     from .renderer.worlds.building import depths_met
 
-    rays = views(ideal_camera(camera), (FINER * camera.rows, FINER * camera.columns))
-    points = depths_met(world.scene, world.placement, *rays)
-    return np.asarray(np.median(points.reshape(camera.rows, FINER, camera.columns, FINER), axis=(1, 3)))
+    origins, directions = views(ideal_camera(camera), camera.shape)
+    beside = camera.target_pitch * ((np.arange(FINER) + 0.5) / FINER - 0.5)
+    moves = [(x, y, 0.0) for x in beside.tolist() for y in beside.tolist()]
+    points = [depths_met(world.scene, world.placement, origins, directions + move) for move in moves]
+    return np.asarray(np.median(points, axis=0)).reshape(camera.shape)
 
 
 def truth_from(setup: Setup) -> str:

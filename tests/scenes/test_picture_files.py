@@ -21,6 +21,7 @@ from skimage import data, io
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats.picture import LUMINANCE, conversions, load, luminance, write_truth
 from ommatid.scenes.formats.picture_file import read_picture
+from ommatid.scenes.formats.stored_picture import StoredPicture
 from ommatid.scenes.scene import Scene, with_changes
 
 from ..examples import scene
@@ -73,15 +74,15 @@ def test_colour_becomes_luminance() -> None:
     from skimage.color import rgb2gray
 
     reference: NDArray[np.float64] = np.asarray(rgb2gray(colour)) * 255  # pyright: ignore
-    np.testing.assert_allclose(luminance(colour, "here"), reference, atol=1e-10)
+    np.testing.assert_allclose(luminance(StoredPicture(colour), "here"), reference, atol=1e-10)
     opaque = np.dstack([colour, np.full(colour.shape[:2], 255, np.uint8)])
-    np.testing.assert_allclose(luminance(opaque, "here"), reference, atol=1e-10)
+    np.testing.assert_allclose(luminance(StoredPicture(opaque), "here"), reference, atol=1e-10)
     opaque[0, 0, 3] = 7
     with pytest.raises(InputError, match="transparent"):
-        luminance(opaque, "here")
+        luminance(StoredPicture(opaque), "here")
     for alpha in (0, 128):  # evenly transparent
         with pytest.raises(InputError, match="transparent"):
-            luminance(np.dstack([colour, np.full(colour.shape[:2], alpha, np.uint8)]), "here")
+            luminance(StoredPicture(np.dstack([colour, np.full(colour.shape[:2], alpha, np.uint8)])), "here")
 
 
 def test_crops_follow_origin_and_shape(tmp_path: Path) -> None:

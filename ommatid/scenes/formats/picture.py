@@ -1,6 +1,6 @@
 """The target's picture in the paper's range of values, 0 to 255; row 0 is its top.
 
-Colour becomes luminance; 8-bit and floating-point values are kept, others are scaled: 16-bit values by 1 / 257.
+Colour becomes luminance; 8-bit and floating-point values are kept, others are scaled: 16-bit values are divided by 257.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from .picture_file import read_picture
 from .stored_picture import BYTES, StoredPicture
 
 COLOURS = 3  # channels, at least, of a colour picture
-STEPS = 257.0  # of a 16-bit value per grey level: 65535 is 255
 LUMINANCE = (0.2125, 0.7154, 0.0721)  # Rec. 709, as scikit-image's rgb2gray weighs
 
 
@@ -64,15 +63,10 @@ def conversions(scene: Scene) -> list[str]:
         return []
     stored, _ = _read(scene, image)
     sentences = notes_of(image, stored)
-    dtype = stored.pixels.dtype
-    if dtype.kind == "u" and dtype.itemsize == 2:
+    bits = stored.bits_each
+    if stored.pixels.dtype.kind == "u" and bits != 8:
         sentences.append(
-            f"{printable(image)} has 16-bit values: they are divided by {STEPS:g}, to the range from 0 to 255"
-        )
-    if stored.bits is not None:
-        sentences.append(
-            f"{printable(image)} has {stored.bits}-bit values: they are multiplied by {_step(stored.bits):g}, to the"
-            " range from 0 to 255"
+            f"{printable(image)} has {bits}-bit values: they are scaled from {2**bits - 1} to the range from 0 to 255"
         )
     return sentences
 
@@ -118,16 +112,14 @@ def write_truth(
     write(path, [Part("truth", channels, record or {})])
 
 
-def luminance(pixels: NDArray[Any], where: str) -> FloatArray:
-    """Convert a (rows, columns[, channels]) picture to one channel of values from 0 to 255. Raises InputError."""
-    values = grey(pixels, where)
-    if pixels.dtype == np.bool_:
-        return values * WHITE
-    if pixels.dtype == np.uint8 or pixels.dtype.kind == "f":
+def luminance(stored: StoredPicture, where: str) -> FloatArray:
+    """Convert a picture to one channel of values from 0 to 255, (rows, columns). Raises InputError."""
+    values, kind, bits = grey(stored.pixels, where), stored.pixels.dtype.kind, stored.bits_each
+    if kind == "f":
         return values
-    if pixels.dtype.kind == "u" and pixels.dtype.itemsize == 2:
-        return values / STEPS
-    raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {pixels.dtype}")
+    if kind == "i" or bits > 16:
+        raise InputError(f"{where}: expected 8-bit, 16-bit or floating-point values, got {stored.pixels.dtype}")
+    return values / ((2**bits - 1) / WHITE)
 
 
 def grey(pixels: NDArray[Any], where: str) -> FloatArray:
@@ -160,7 +152,7 @@ def _part_asked_for(scene: Scene, stored: StoredPicture) -> FloatArray:
     """The crop of a picture in the scene's range of values, rounded to float32. Raises InputError."""
     target, where = scene.target, f"{scene.source}: target.image"
     with np.errstate(over="ignore", invalid="ignore"):  # of values that are not finite, which are refused below
-        picture = luminance(stored.pixels, where) * (1.0 if stored.bits is None else _step(stored.bits))
+        picture = luminance(stored, where)
     if target.origin is None:
         if target.shape is not None and finer(target.shape, target.detail) != picture.shape:
             rows, columns = finer(target.shape, target.detail)
@@ -203,11 +195,6 @@ def _stored(image: str, where: str) -> StoredPicture:
     """Read the picture that `target.image` names, without scaling."""
     name = image.removeprefix("photo:")
     return read_picture(Path(image) if name == image else _photo_path(name, where), where)
-
-
-def _step(bits: int) -> float:
-    """Grey levels per value of a PNG file with fewer than 8 bits."""
-    return WHITE / (2**bits - 1)
 
 
 def _photo_path(name: str, where: str) -> Path:

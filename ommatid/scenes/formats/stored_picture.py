@@ -30,6 +30,11 @@ class StoredPicture:
     bits: int | None = None
     notes: tuple[str, ...] = ()
 
+    @property
+    def bits_each(self) -> int:
+        """Bits per number: 1 of a truth value."""
+        return self.bits or (1 if self.pixels.dtype.kind == "b" else 8 * self.pixels.dtype.itemsize)
+
 
 def check_size(path: Path, numbers: int) -> None:
     """Raise InputError if so many numbers do not fit into memory; to be called before they are decoded."""

@@ -49,9 +49,8 @@ class FrameNotes:
     def add(self, path: Path, stored: StoredPicture, what: str) -> None:
         """Note one picture."""
         self.sentences.setdefault(what, notes_of(str(path), stored))
-        dtype = stored.pixels.dtype
-        bits = 8 * dtype.itemsize if stored.bits is None else stored.bits
-        self.types.setdefault(FLOATING if dtype.kind == "f" else f"{bits}-bit", what)
+        is_floating = stored.pixels.dtype.kind == "f"
+        self.types.setdefault(FLOATING if is_floating else f"{stored.bits_each}-bit", what)
 
     def describe(self) -> list[str]:
         """Return a sentence each."""

@@ -33,7 +33,7 @@ OWN = {
     "ommatid.scenes.tables.gallery": "scenes of the installation",
     "ommatid.scenes.formats.npz": "a stream that is open, and members of an archive",
     "ommatid.scenes.formats.picture": "pictures, which are checked before",
-    "ommatid.scenes.formats.exr": "/dev/null",
+    "ommatid.scenes.formats.stored_picture": "/dev/null",
     "ommatid.simulate.renderer.world": "files of a world",
     "ommatid.simulate.sampling.checkpoint": "a temporary file, which it writes",
     "ommatid.reconstruct.output.estimate_formats": "temporary files, which it writes",

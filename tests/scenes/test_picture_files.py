@@ -284,6 +284,11 @@ def test_texts_and_profiles_are_inflated_up_to_a_limit(name: bytes, tmp_path: Pa
         tracemalloc.stop()
 
 
+def test_what_libraries_print_of_a_sound_picture_is_not_shown(capfd: pytest.CaptureFixture[str]) -> None:
+    load(with_changes(scene().plain(), Path("scene.toml"), ("target.image=photo:page", "target.origin=[0,0]"), ()))
+    assert capfd.readouterr() == ("", "")
+
+
 def write_large_headers(folder: Path) -> None:
     """Write a file of each format whose header states some 60000 x 60000 pixels, with almost none."""
     (folder / "a.png").write_bytes(made.png_of(made.header(65500, 65500, 2), made.chunk(b"IDAT", bytes(99))))

@@ -8,12 +8,8 @@ report a full disk when little is written, and reads a truncated file as a short
 from __future__ import annotations
 
 import errno
-import io
 import json
-import os
-import sys
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -28,7 +24,7 @@ from ommatid.runtime.input_files import check_regular, parse_json
 from ommatid.runtime.machine import check_memory
 from ommatid.runtime.printable import printable
 
-from .stored_picture import BYTES, StoredPicture, several
+from .stored_picture import BYTES, StoredPicture, several, silenced
 
 ATTRIBUTE = "ommatid"
 TWICE = 2 * 4  # bytes of a number: the library's copy and the array here
@@ -68,7 +64,7 @@ def write(path: Path, parts: Sequence[Part]) -> None:
 
     def fill(beside: Path) -> None:
         try:
-            with _silenced():
+            with silenced():
                 OpenEXR.File(files).write(str(beside))
             if len(read(beside)) != len(parts):
                 raise InputError("parts are missing")
@@ -144,7 +140,7 @@ def _parts(path: Path, bytes_each: int = 0) -> list[Any]:
 
     try:
         check_regular(path)
-        with _silenced():
+        with silenced():
             parts = list(OpenEXR.File(str(path), separate_channels=True, header_only=True).parts)
         if any("deep" in str(part.header.get("type")) for part in parts):
             raise InputError(f"{path}: expected one value per pixel and channel, got a deep picture; save it flat")
@@ -152,7 +148,7 @@ def _parts(path: Path, bytes_each: int = 0) -> list[Any]:
             return parts
         numbers = sum(prod(_extent(part.header)) * len(part.header["channels"]) for part in parts)
         check_memory(bytes_each * numbers, f"{path}: to read it", "take a smaller one, or free some memory")
-        with _silenced():
+        with silenced():
             return list(OpenEXR.File(str(path), separate_channels=True).parts)
     except InputError:
         raise
@@ -201,22 +197,3 @@ def _altered(path: Path, name: str) -> str:
 def _seal(channels: dict[str, NDArray[np.float32]]) -> str:
     """SHA-256 of all channels."""
     return digest(*(channels[name] for name in sorted(channels)))
-
-
-@contextmanager
-def _silenced() -> Generator[None]:
-    """Discard the library's warnings on stdout and stderr; errors are reported by exceptions."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    saved = os.dup(1), os.dup(2)
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(null, 1)
-        os.dup2(null, 2)
-        with redirect_stdout(io.StringIO()):  # some warnings pass through Python's sys.stdout
-            yield
-    finally:
-        os.dup2(saved[0], 1)
-        os.dup2(saved[1], 2)
-        for descriptor in (*saved, null):
-            os.close(descriptor)

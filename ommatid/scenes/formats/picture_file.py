@@ -22,7 +22,16 @@ from ommatid.runtime.input_files import check_regular, open_input
 from ommatid.runtime.machine import check_memory
 
 from . import exr, npz, tiff
-from .stored_picture import ORIENTATION_TAG, UPRIGHT, StoredPicture, check_size, profile_notes, several, upright
+from .stored_picture import (
+    ORIENTATION_TAG,
+    UPRIGHT,
+    StoredPicture,
+    check_size,
+    profile_notes,
+    several,
+    silenced,
+    upright,
+)
 
 MOST_COLOURS = len("RGBA")
 LINEAR, USUAL = 1.0, 1 / 2.2  # gammas: of values proportional to light, and of most pictures
@@ -89,7 +98,8 @@ def _png(stream: BinaryIO, path: Path) -> Iterator[StoredPicture]:
         check_size(path, prod(opened.size) * channels)
         opened.load()  # what stands behind the pixels, too
         orientation = _orientation(opened)
-    pixels = np.asarray(cast(Any, imagecodecs).png_decode(data))
+    with silenced():
+        pixels = np.asarray(cast(Any, imagecodecs).png_decode(data))
     bits = data[24]  # per number: of the header, which comes first
     is_scaled = bits < 8 and not is_palette
     if is_scaled:

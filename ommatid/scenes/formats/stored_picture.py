@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import os
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -65,3 +70,22 @@ def profile_notes(profile: bytes) -> tuple[str, ...]:
     """Return what is said of a picture with an ICC profile: nothing for sRGB, which is what most pictures are."""
     usual = not profile or b"sRGB" in profile or "sRGB".encode("utf-16-be") in profile
     return () if usual else ("has a colour profile, which is not applied: its values are used as they are",)
+
+
+@contextmanager
+def silenced() -> Generator[None]:
+    """Discard warnings that C libraries print on stdout and stderr; errors are reported by exceptions."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = os.dup(1), os.dup(2)
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 1)
+        os.dup2(null, 2)
+        with redirect_stdout(io.StringIO()):  # some warnings pass through Python's sys.stdout
+            yield
+    finally:
+        os.dup2(saved[0], 1)
+        os.dup2(saved[1], 2)
+        for descriptor in (*saved, null):
+            os.close(descriptor)

@@ -38,7 +38,7 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
     Raises ValueError that says why it cannot be read, and InputError for arrays that do not fit into memory.
     """
     with _readable(), open_input(path) as stream:
-        end = cast(Any, zipfile)._EndRecData(stream)
+        end = cast(Any, zipfile)._EndRecData(stream)  # by which `ZipFile` itself finds the list, before it reads it
         if end is None or end[DIRECTORY_SIZE] > LARGEST_DIRECTORY:
             raise ValueError("it is no archive, or has too many members")
         stream.seek(0)

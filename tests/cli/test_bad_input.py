@@ -199,7 +199,7 @@ WRONG = {
     "show tiny.toml --set noise.variance=-1": "tiny.toml with --set noise.variance=-1: noise.variance: expected",
     "show tiny.toml --set camera.lens.*.pixels=[9,9]": "with --set camera.lens.*.pixels=[9,9]: camera.lens.I.pixels",
     "show tiny.toml --set noise.bits=8 --set noise.sigma=1": "tiny.toml with --set noise.sigma=1: unknown key",
-    "show tiny.toml --set render.seed=1 --set target.image=a.png": "with --set target.image=a.png: target.image: there",
+    "show tiny.toml --set render.seed=1 --set target.image=a.png": "with --set target.image=a.png: target.image: ",
     "show tiny.toml --set noise.bits=8.5": "expected a whole number, got 8.5",
     "show tiny.toml --set noise.bits=64": "expected a number of at most 24",
     "show tiny.toml --set camera.walls=yes": "expected true or false, got 'yes'",

@@ -153,19 +153,17 @@ def _part_asked_for(scene: Scene, stored: StoredPicture) -> FloatArray:
     target, where = scene.target, f"{scene.source}: target.image"
     with np.errstate(over="ignore", invalid="ignore"):  # of values that are not finite, which are refused below
         picture = luminance(stored, where)
-    if target.origin is None:
-        if target.shape is not None and finer(target.shape, target.detail) != picture.shape:
-            rows, columns = finer(target.shape, target.detail)
-            raise InputError(
-                f"{scene.source}: target.shape asks for {rows} x {columns} pixels, but the picture has"
-                f" {picture.shape[0]} x {picture.shape[1]}; add target.origin to cut a crop from it, or remove"
-                " target.shape for the whole picture"
-            )
-        crop = picture[tuple(slice(size - size % target.detail) for size in picture.shape)]
-    else:
-        crop = _crop(picture, scene)
+    asked = picture.shape if target.shape is None else finer(target.shape, target.detail)
+    if target.origin is None and asked != picture.shape:
+        raise InputError(
+            f"{scene.source}: target.shape asks for {asked[0]} x {asked[1]} pixels, but the picture has"
+            f" {picture.shape[0]} x {picture.shape[1]}; add target.origin to cut a crop from it, or remove"
+            " target.shape for the whole picture"
+        )
     with np.errstate(over="ignore", invalid="ignore"):
-        rounded = crop.astype(np.float32).astype(np.float64)  # the precision of the renderer and of truth.exr
+        rounded = (
+            _crop(picture, scene).astype(np.float32).astype(np.float64)
+        )  # precision of renderer and files
     if not np.isfinite(rounded).all():
         raise InputError(f"{where}: {target.image} holds NaN or infinite values in the part asked for; replace them")
     largest = float(np.abs(rounded).max(initial=0.0))

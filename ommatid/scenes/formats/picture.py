@@ -161,9 +161,7 @@ def _part_asked_for(scene: Scene, stored: StoredPicture) -> FloatArray:
             " target.shape for the whole picture"
         )
     with np.errstate(over="ignore", invalid="ignore"):
-        rounded = (
-            _crop(picture, scene).astype(np.float32).astype(np.float64)
-        )  # precision of renderer and files
+        rounded = _crop(picture, scene).astype(np.float32).astype(np.float64)  # precision of renderer and files
     if not np.isfinite(rounded).all():
         raise InputError(f"{where}: {target.image} holds NaN or infinite values in the part asked for; replace them")
     largest = float(np.abs(rounded).max(initial=0.0))

@@ -222,20 +222,18 @@ class _Expansion:
         try:
             found = next((at for base in self._searched if name and (at := base / name).exists()), None)
             if found is None:
-                raise InputError(f"{place}: expected a {what} beside the world's, found no '{shown}'; add or remove it")
+                raise InputError(f"expected a {what} beside the world's, found no '{shown}'; add or remove it")
             whole = found.resolve(strict=True)
             if self._within is not None and not whole.is_relative_to(self._within):
                 raise InputError(
-                    f"{place}: expected a {what} in the folder of the world's file, got '{shown}' outside it; move it"
-                    " there, or add --allow-outside"
+                    f"expected a {what} in the folder of the world's file, got '{shown}' outside it; move it there, or"
+                    " add --allow-outside"
                 )
             if is_folder != whole.is_dir():
-                raise InputError(f"{place}: expected a {what}, got '{shown}'")
+                raise InputError(f"expected a {what}, got '{shown}'")
             if not is_folder:
                 check_regular(whole)
         except InputError as error:
-            if str(error).startswith(place):
-                raise
             raise InputError(f"{place}: {error}") from error
         except (OSError, RuntimeError, ValueError) as error:  # a circle of links, a name that is too long
             raise InputError(f"{place}: '{shown}' could not be opened; correct it") from error

@@ -34,8 +34,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.toml import changes_of
 
-from . import notebook
-from .result import Result, check_type
+from .result import Result, check_type, show_in_notebooks
 
 __all__ = ["InputError", "MachineError", "Model", "Reconstructor", "Result", "Scene", "Stack"]
 
@@ -158,21 +157,13 @@ def calibrate(scene: Scene | str | Path, stack: Stack | None = None) -> Model:
     stack : with calibration.samples = "auto" the stack that H is for, as in `run`; None: images drawn from the prior
     Raises InputError for a scene that cannot be calibrated here.
     """
-    from ommatid.analysis.calibration_goal import for_stack
-    from ommatid.simulate.calibrate import cached_model
-    from ommatid.simulate.validation import check_scene
-
     setup = _setup(scene)
+    if stack is not None:
+        check_type("stack", stack, Stack, "read_stack")
+        if stack.camera.describe() != setup.camera.describe():
+            raise InputError(f"{setup.scene.source}: expected a stack of this scene's camera, got one of another")
     with TemporaryDirectory(prefix="ommatid-") as folder:
-        path = Path(folder) / "model.npz"
-        if stack is None:
-            model, _ = stages.calibrated_model(setup, path, no_progress)
-        else:
-            check_type("stack", stack, Stack, "read_stack")
-            check_scene(setup)
-            if stack.camera.describe() != setup.camera.describe():
-                raise InputError(f"{setup.scene.source}: expected a stack of this scene's camera, got one of another")
-            model, _ = cached_model(path, setup, no_progress, for_stack(stack))
+        model, _ = stages.calibrated_model(setup, Path(folder) / "model.npz", no_progress, stack)
     return replace(model, scene=setup.resolved)
 
 
@@ -233,4 +224,4 @@ def _setup(scene: Scene | str | Path) -> Setup:
     return stages.checked_setup(_scene(scene))
 
 
-notebook.show_in_notebooks()
+show_in_notebooks()

@@ -15,7 +15,7 @@ from fractions import Fraction
 import numpy as np
 
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.reconstruct.output.verdict_words import LEAST_GAIN, NextStep, is_trusted, steps_of
+from ommatid.reconstruct.output.verdict_words import LEAST_GAIN, NextStep, steps_of
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import one_thread
 from ommatid.scenes.camera import derive
@@ -29,7 +29,7 @@ from .design import with_lens
 def next_steps(report: RunReport, other: AnotherType | None = None) -> list[NextStep]:
     """Return the changes that reduce the error by a twentieth or more, the best first; none for a run without trust."""
     now = report.error.predicted_mse
-    if not is_trusted(report) or now <= 0:
+    if not report.verdict.trusted or now <= 0:
         return []
     steps = steps_of(report)
     if other is not None:

@@ -19,18 +19,17 @@ import numpy as np
 from ommatid.reconstruct.methods.method import Prepared
 from ommatid.reconstruct.output import result_files
 from ommatid.reconstruct.output.estimate_formats import Format, check_formats, files_in_formats, write_formats
-from ommatid.reconstruct.output.result_files import Region, region_reports
+from ommatid.reconstruct.output.result_files import Region
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.reconstruct.restore import check_camera, check_region
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.execution.pool import worker_pool
+from ommatid.runtime.execution.cluster import worker_pool
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint, temporary_file
 from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.kinds import check_folder, check_name
 from ommatid.runtime.outputs.occupied import new_folder
 from ommatid.runtime.progress import Progress, no_progress
-from ommatid.runtime.versions import origin
 from ommatid.scenes import model_file
 from ommatid.scenes import stack as stack_file
 from ommatid.scenes.model import Model
@@ -200,10 +199,8 @@ def _in_processes(frames: Sequence[Frame], prepared: Prepared, options: FrameOpt
     with temporary_file(frames[0].output.with_name("prepared")) as contents:
         contents.write_bytes(pickle.dumps(prepared.contents(*SENT)))
         with worker_pool(count=min(workers, len(others))) as pool:
-            for task in pool.each(partial(_made_in_process, options, contents), others):
-                if task.loss is not None:
-                    raise task.loss
-                yield others[task.index], task.result
+            for index, result in pool.each(partial(_made_in_process, options, contents), others):
+                yield others[index], result
 
 
 def reconstruct_file(
@@ -225,8 +222,8 @@ def _made(
     stack = options.applied(stack_file.read(frame.stack), frame.stack)
     truth = result_files.truth_beside(frame.stack, stack)
     names = frame.stack, options.model
-    outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, workers, progress, prepared)
-    report = report.with_changes(fingerprint=frame.fingerprint, **origin(), **region_reports(outcome, options.regions))
+    shared = workers, progress, prepared, frame.fingerprint, options.regions
+    outcome, report = result_files.reconstruct(stack, prepared.model, truth, names, *shared)
     picture = frame.output.with_suffix(".png")
     earlier = [picture, *files_in_formats(frame.output)]
     result_files.write_estimate(frame.output, outcome, result_files.record_of(report))

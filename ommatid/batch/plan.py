@@ -17,6 +17,7 @@ from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY, allowed_memory, choose_method
 from ommatid.reconstruct.output.result_files import fingerprint_of, read_results, truth_beside
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.machine import processors
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
 from ommatid.scenes.setup import Setup
@@ -124,6 +125,15 @@ def _calibrated_pixels(setup: Setup) -> float:
         subset = subsets.get(lens.name)
         pixels += lens.measurements if subset is None else subset.size
     return pixels * (RENDERINGS if setup.renders_points else 1)
+
+
+def process_count(members: Sequence[Member]) -> int:
+    """Return the number of processes that finishes a batch soonest, of as many as fit into memory."""
+    if min(len(members), processors()) < 2:
+        return 1
+    costs = [estimate_cost(member) for member in members]
+    most = min(concurrent_by_memory([cost.memory for cost in costs]), len(members), processors())
+    return fastest_process_count([cost.seconds for cost in costs], most, processors())
 
 
 def concurrent_by_memory(memory: Sequence[int]) -> int:

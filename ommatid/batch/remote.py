@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -47,25 +47,12 @@ Stages = Callable[[Setup, Path, RunObserver], dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class WorldPackage:
-    """A world's file and those that it names.
-
-    root : the folder that holds all of them;  file : the world's, relative to it
-    contents : of the files, by their paths relative to `root`
-    """
-
-    root: str
-    file: str
-    contents: dict[str, bytes]
-
-
-@dataclass(frozen=True)
 class ScenePackage:
     """Everything that a worker needs for a scene.
 
     tables, source : the scene, and its file for messages;  image : on the target, (rows, columns)
     folder, files : the scene's folder for messages, and its content;  command : words of the command line
-    world : the files of its [world], if it has one
+    world : content of the files of its [world] by their paths inside `world_root`, `world_file` that of the world's own
     """
 
     tables: dict[str, Any]
@@ -74,7 +61,9 @@ class ScenePackage:
     folder: str
     files: dict[str, bytes]
     command: tuple[str, ...] = ()
-    world: WorldPackage | None = None
+    world: dict[str, bytes] = field(default_factory=dict[str, bytes])
+    world_root: str = ""
+    world_file: str = ""
 
 
 @dataclass(frozen=True)
@@ -84,9 +73,9 @@ class SceneOutcome:
     removed : names of files that the stages removed
     """
 
-    files: dict[str, bytes]
-    done: dict[str, bool]
-    description: dict[str, Any]
+    files: dict[str, bytes] = field(default_factory=dict[str, bytes])
+    done: dict[str, bool] = field(default_factory=dict[str, bool])
+    description: dict[str, Any] = field(default_factory=dict[str, Any])
     error: Exception | None = None
     removed: tuple[str, ...] = ()
 
@@ -94,8 +83,8 @@ class SceneOutcome:
 def packed(setup: Setup, folder: Path) -> ScenePackage:
     """Pack a scene, the content of its folder, and its world. Raises InputError."""
     tables, source = setup.resolved.plain(), str(setup.scene.source)
-    world = None if setup.scene.world is None else packed_world(setup.scene)
-    return ScenePackage(tables, source, setup.picture, str(folder), _contents(folder), command(), world)
+    package = ScenePackage(tables, source, setup.picture, str(folder), _contents(folder), command())
+    return package if setup.scene.world is None else _with_world(package, setup.scene)
 
 
 def carry_out(stages: Stages, package: ScenePackage | SceneOutcome) -> SceneOutcome:
@@ -107,11 +96,11 @@ def carry_out(stages: Stages, package: ScenePackage | SceneOutcome) -> SceneOutc
         return package
     with TemporaryDirectory(prefix="ommatid-", dir=scratch_folder()) as temporary:
         folder = Path(temporary)
-        for path, content in [(path_inside(folder, name), content) for name, content in package.files.items()]:
-            path.write_bytes(content)
+        write_inside(folder, package.files)
+        world = path_inside(folder / WORLD, package.world_file) if package.world_file else None
 
         def work(observer: RunObserver) -> dict[str, Any]:
-            world = None if package.world is None else unpacked_world(package.world, folder / WORLD)
+            write_inside(folder / WORLD, package.world)
             scene = parse(package.tables, Path(package.source), world)
             return stages(Setup(scene, derive(scene), package.image), folder, observer)
 
@@ -120,21 +109,22 @@ def carry_out(stages: Stages, package: ScenePackage | SceneOutcome) -> SceneOutc
         error = outcome.error
         if isinstance(error, InputError | MachineError):
             message = "".join(map(str, error.args[:1]))  # as raised: names of folders are replaced in whole
-            if package.world is not None:
-                message = message.replace(str(folder / WORLD), package.world.root)
+            if world is not None:
+                message = message.replace(str(folder / WORLD), package.world_root)
             error = type(error)(message.replace(temporary, package.folder))
         contents = _contents(folder)
         files = {name: content for name, content in contents.items() if package.files.get(name) != content}
         return replace(outcome, files=files, error=error, removed=tuple(package.files.keys() - contents.keys()))
 
 
-def outcome_of(work: Callable[[RunObserver], dict[str, Any]]) -> SceneOutcome:
-    """Execute `work`; return its finished stages and its results or its error, without files."""
+def outcome_of(work: Callable[[RunObserver], dict[str, Any]], observer: RunObserver | None = None) -> SceneOutcome:
+    """Execute `work`; return its results or its error, and its finished stages unless an `observer` is told of them."""
     done: dict[str, bool] = {}
+    collecting = RunObserver(lambda _: nullcontext(no_progress), done.__setitem__)
     try:
-        return SceneOutcome({}, done, work(RunObserver(lambda _: nullcontext(no_progress), done.__setitem__)))
+        return SceneOutcome({}, done, work(observer or collecting))
     except (InputError, MachineError, OSError, MemoryError) as error:
-        return SceneOutcome({}, done, {}, error)
+        return SceneOutcome({}, done, error=error)
 
 
 def unpack(outcome: SceneOutcome, folder: Path) -> None:
@@ -166,7 +156,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(files, key=lambda path: (path.name == LAST, path.name))}
 
 
-def packed_world(scene: Scene) -> WorldPackage:
+def _with_world(package: ScenePackage, scene: Scene) -> ScenePackage:
     """Pack the world of a scene. Raises InputError for a file that it names by an absolute path."""
     from ommatid.simulate.renderer.world import files, path_of
 
@@ -180,20 +170,16 @@ def packed_world(scene: Scene) -> WorldPackage:
                 f"{scene.source}: world.file: names {path}, which other machines may not have;"
                 " name it relative to the world's file, or leave out --scheduler"
             )
-    return WorldPackage(str(root), str(Path(os.path.normpath(path_of(scene))).relative_to(root)), contents)
+    own = Path(os.path.normpath(path_of(scene))).relative_to(root)
+    return replace(package, world=contents, world_root=str(root), world_file=str(own))
 
 
-def unpacked_world(package: WorldPackage, folder: Path) -> Path:
-    """Write the files of a world into a folder, and return the path of the world's own.
-
-    Raises InputError before anything is written if a name leads out of the folder.
-    """
-    world, paths = path_inside(folder, package.file), {name: path_inside(folder, name) for name in package.contents}
-    for name, content in package.contents.items():
-        path = paths[name]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-    return world
+def write_inside(folder: Path, contents: dict[str, bytes]) -> None:
+    """Write files into a folder, by their names. Raises InputError, before anything, if one leads out of the folder."""
+    paths = {name: path_inside(folder, name) for name in contents}
+    for name, content in contents.items():
+        paths[name].parent.mkdir(parents=True, exist_ok=True)
+        paths[name].write_bytes(content)
 
 
 def path_inside(folder: Path, name: str) -> Path:

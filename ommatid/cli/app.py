@@ -23,9 +23,9 @@ from ommatid.runtime.library_caches import library_caches
 from ommatid.runtime.printable import printable
 from ommatid.runtime.versions import command_line
 
-from . import calibrate, output, predict, reconstruct, run, show, studies
+from . import calibrate, output, reconstruct, run, show, studies
 from .failures import exit_code_of
-from .groups import grouped
+from .options import grouped
 
 ERRORS = "ommatid.ascii"
 # what a terminal without Unicode shows in place of the characters that this program prints
@@ -54,7 +54,7 @@ for command in (
 ):
     with_arguments()(grouped(command))
 with_arguments("import")(grouped(calibrate.import_frames))
-for command in (predict.predict, predict.design, studies.bench, show.show, show.export):
+for command in (run.predict, run.design, studies.bench, show.show, show.export):
     with_arguments()(grouped(command))
 for command in (show.init, studies.paper, studies.stability, show.schema, show.doctor):
     app.command()(grouped(command))

@@ -1,10 +1,16 @@
-"""Options that several commands share, single ones and groups, and the values that follow from them."""
+"""Options that several commands share, and the values that follow from them.
+
+A group of options is a frozen dataclass of annotated fields, which is one parameter of every command that has them.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
 
 import typer
 
@@ -140,10 +146,19 @@ class Processes:
 
     @property
     def pool(self) -> tuple[Cluster | None, int | None]:
-        """The cluster of `--scheduler`, None without the option, and the number of processes."""
+        """The cluster of `--scheduler`, None without the option, and the number of processes.
+
+        Raises InputError for both, and for a cluster that cannot be used.
+        """
+        if not self.scheduler:
+            return None, self.workers
         from ommatid.runtime.execution.cluster import Cluster
 
-        return Cluster(self.scheduler) if self.scheduler else None, self.workers
+        if self.workers is not None:
+            raise InputError("--scheduler and --workers: expected one, a cluster or the number of processes here")
+        cluster = Cluster(self.scheduler)
+        cluster.check()
+        return cluster, None
 
 
 @dataclass(frozen=True)
@@ -284,3 +299,38 @@ def _integers(option: str, text: str, expected: str, example: str) -> list[int]:
     except ValueError as error:
         raise InputError(f"{option}: expected {expected}, such as {example}, got '{shortened(text)}'") from error
     return numbers
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command for the parser, which has an option for each field of a group in place of the group itself."""
+    signature = inspect.signature(command, eval_str=True)
+    annotations: dict[str, Any] = {name: each.annotation for name, each in signature.parameters.items()}
+    groups = {name: cast(type[Any], each) for name, each in annotations.items() if is_dataclass(each)}
+    parameters = [
+        each
+        for name, parameter in signature.parameters.items()
+        for each in (_options_of(groups[name]) if name in groups else [parameter])
+    ]
+    named = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+
+    @wraps(command)
+    def called(**values: Any) -> None:
+        collected = {
+            name: group(**{field.name: values.pop(field.name) for field in fields(group)})
+            for name, group in groups.items()
+        }
+        command(**values, **collected)
+
+    called.__signature__ = signature.replace(parameters=named)  # type: ignore[attr-defined]
+    called.__annotations__ = {each.name: each.annotation for each in named}
+    return called
+
+
+def _options_of(group: type[Any]) -> list[inspect.Parameter]:
+    hints = get_type_hints(group, include_extras=True)
+    return [
+        inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
+        )
+        for field in fields(group)
+    ]

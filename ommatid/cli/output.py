@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, nullcontext, suppress
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -107,22 +106,15 @@ class Bars:
         """Create bars; quiet : True to show and say nothing;  alone : True for a process that runs a single scene."""
         from rich import progress as rich_progress
         from rich.console import Console
-        from rich.progress import BarColumn, ProgressColumn, Task, TaskProgressColumn, TextColumn
-        from rich.text import Text
 
-        class TimeLeft(ProgressColumn):
-            """The time left at the mean speed, from the first step on, which may take minutes."""
-
-            def render(self, task: Task) -> Text:
-                """Return it as h:mm:ss."""
-                left = (task.elapsed or 0.0) * (1 / task.completed - 1) if task.completed else None
-                return Text(
-                    "" if left is None else f"{timedelta(seconds=round(left))} left", style="progress.remaining"
-                )
-
+        columns = (
+            rich_progress.TextColumn("{task.description:11}"),
+            rich_progress.BarColumn(),
+            rich_progress.TaskProgressColumn(),
+            rich_progress.TimeRemainingColumn(),
+        )
         self.progress: Progress = no_progress
         self._quiet, self._alone = quiet, alone
-        columns = (TextColumn("{task.description:11}"), BarColumn(), TaskProgressColumn(), TimeLeft())
         console = Console(stderr=True)
         disabled = quiet or not console.is_terminal
         self._shown = rich_progress.Progress(
@@ -195,10 +187,9 @@ def print_report(name: str, page: Path | None, report: RunReport, sections: Iter
     name : of the scene;  page : its report.html, None without one;  sections : its tables
     """
     from ommatid.reconstruct.output.facts import summary_lines, verdict_line
-    from ommatid.reconstruct.output.verdict_words import is_trusted
 
     if detail == "table":
         print_tables(sections)
         return
     lines = [verdict_line(name, report)] if detail == "verdict" else summary_lines(name, report, page)
-    print_lines(lines, alarm=not is_trusted(report))
+    print_lines(lines, alarm=not report.verdict.trusted)

@@ -139,7 +139,6 @@ def _reconstruct_one(
     from ommatid.pipeline.stages import write_figures
     from ommatid.reconstruct.output import facts
     from ommatid.reconstruct.output.estimate_formats import write_formats
-    from ommatid.reconstruct.output.verdict_words import is_trusted
 
     whole = reconstruction.is_folder(file)
     if not whole:
@@ -160,7 +159,7 @@ def _reconstruct_one(
     else:
         page = file / "report.html" if whole else None
         output.print_report(str(file), page, report, [(str(file), facts.rows(report))], detail)
-    if strict and not is_trusted(report):
+    if strict and not report.verdict.trusted:
         raise failures.BatchError(failures.NOT_TRUSTED)
 
 
@@ -178,14 +177,14 @@ def _reconstruct_many(
     frame failed or, if `strict`, if one is not to be trusted.
     """
     from ommatid.batch.frames import reconstruct_frames
-    from ommatid.page.batch_index import check_index
+    from ommatid.page.batch_index import INDEX
+    from ommatid.page.cached import check_own_page
     from ommatid.pipeline.reconstruction import finish_film
-    from ommatid.reconstruct.output.verdict_words import is_trusted
 
     if not stacks:
         missing = "name a stack before it" if common.model.suffix == ".npz" else "name its model, model.npz, after it"
         raise InputError(f"{common.model}: expected stacks and then their model, got one file; {missing}")
-    check_index(folder)
+    check_own_page(folder / INDEX)
     described: dict[Path, DescribedFrame] = {}
     with output.progress_bar("reconstruct", quiet=detail == "verdict") as progress:
         for frame, work in reconstruct_frames(stacks, folder, common, workers, progress):
@@ -195,7 +194,7 @@ def _reconstruct_many(
     if detail != "verdict":
         output.say(f"film: {shown}; {index}" if shown else f"{index}: written")
     _print_frames(folder, frames, detail)
-    doubted = strict and not all(each.report is None or is_trusted(each.report) for each in frames)
+    doubted = strict and not all(each.report is None or each.report.verdict.trusted for each in frames)
     worst = max(failures.NOT_TRUSTED if doubted else 0, *(each.code for each in frames))
     if worst:
         raise failures.BatchError(worst)
@@ -307,13 +306,13 @@ def check(
 
     Names those that disagree: their H is wrong, or their pixels. Needs no truth.
     """
-    from ommatid.analysis import held_out
     from ommatid.batch.frames import FrameOptions
     from ommatid.pipeline.reconstruction import check_held_out_files
+    from ommatid.reconstruct.output.verdict_words import held_out_rows
 
     common = FrameOptions(model, *changes.both)
     with output.progress_bar("check") as progress:
         report = check_held_out_files(stack, common, fitted=not scene_prior, progress=progress)
-    output.print_result(report.plain(), [(f"{stack}, predicted sub-imagers", held_out.rows(report))], as_json)
+    output.print_result(report.plain(), [(f"{stack}, predicted sub-imagers", held_out_rows(report))], as_json)
     if strict and report.verdict.trusted is False:
         raise failures.BatchError(failures.NOT_TRUSTED)

@@ -1,23 +1,31 @@
-"""Commands on whole scenes, one or many: run and render."""
+"""Commands on whole scenes: run, render and predict, of one or many, and design."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ommatid.runtime.errors import InputError
 
 from . import failures, options, output
 from .options import (
     Baselines,
+    Changes,
     DryRun,
     Folder,
+    FolderIfAny,
     Force,
     Formats,
     Jobs,
     Json,
     Printing,
+    SceneFile,
     SceneFiles,
     Strict,
     Sweeps,
@@ -28,6 +36,15 @@ from .options import (
 if TYPE_CHECKING:
     from ommatid.batch.batch import Member
 
+NoRays = Annotated[bool, typer.Option("--no-rays", help="A perfect H and a perfect rendering: Eq. 5 without rays.")]
+Steer = Annotated[
+    str,
+    typer.Option(
+        "--steer",
+        metavar="RUN|ROW,COLUMN,ROWS,COLUMNS",
+        help="Place windows where they lower the errors of a run or a region most.",
+    ),
+]
 STARTED = perf_counter()  # from which --within counts
 
 
@@ -48,7 +65,7 @@ def run(
     """Render, calibrate, reconstruct and report."""
     from ommatid.pipeline import stages
     from ommatid.pipeline.batches import Batch, BatchFiles, batch_members, batch_warnings, run_batch, share_of_job
-    from ommatid.pipeline.time_budget import check_within, stages_within
+    from ommatid.pipeline.time_budget import TimeBudget
 
     detail, (others, figures) = printing.detail, options.formats(formats)
     members, words = share_of_job(jobs.job, batch_members(scenes, folder, sweep, *changes.both), jobs.scheduler)
@@ -56,12 +73,13 @@ def run(
     if dry_run:
         _print_plans(members, force, printing.as_json)
         return
-    work, check, (cluster, workers) = stages.run, stages.check_run, jobs.pool
+    run_scene, (cluster, workers) = partial(stages.run, force=force), jobs.pool
     if within:
-        time = options.seconds(within)
-        work = stages_within(time, members, STARTED, output.warn, jobs.scheduler, workers)
-        check, workers = check_within, 1
-    work = stages.SceneWork(work, check if force else None, others, figures, baselines)
+        if cluster is not None or workers is not None:
+            raise InputError("--within divides the time of one process; leave out --scheduler and --workers")
+        folders = [member.folder for member in members]
+        run_scene, workers = TimeBudget(options.seconds(within), folders, STARTED, output.warn, force=force), 1
+    work = stages.SceneWork(run_scene, others, figures, baselines)
     files = BatchFiles(None if jobs.job else folder, folder, figures)
     with output.batch_bars(len(members), printing.quiet) as bars:
         batch = Batch(work, bars.observer, partial(_print_run, detail, bars))
@@ -119,8 +137,66 @@ def render(
 
     members, words = share_of_job(jobs.job, batch_members(scenes, folder, sweep, *changes.both), jobs.scheduler)
     output.warn_all(batch_warnings(members))
-    check, files = stages.check_render if force else None, BatchFiles(None if jobs.job else folder)
+    files = BatchFiles(None if jobs.job else folder)
     with output.batch_bars(len(members)) as bars:
-        batch = Batch(stages.SceneWork(stages.render, check), bars.observer, report)
+        batch = Batch(stages.SceneWork(partial(stages.render, force=force)), bars.observer, report)
         outcome = run_batch(batch, members, failures.report, *jobs.pool, bars.progress, files=files)
     failures.finish_batch(outcome, as_json, job_words=words)
+
+
+def predict(
+    scenes: SceneFiles,
+    changes: Changes,
+    printing: Printing,
+    sweep: Sweeps = None,
+    folder: FolderIfAny = None,
+    no_rays: NoRays = False,
+    formats: Formats = "",
+) -> None:
+    """Predict the error, the rank and the null space of H, and compare several scenes.
+
+    From Eq. 5, and a few rays where they matter: no picture is rendered.
+    """
+    from ommatid.pipeline import stages
+    from ommatid.pipeline.batches import Batch, BatchFiles, batch_members, batch_warnings, run_batch
+    from ommatid.pipeline.sections import predicted_lines, predicted_sections
+
+    if folder is not None and not sweep:
+        raise InputError("predict: -o is for the table and the plot of a --sweep; name keys to sweep, or leave it out")
+    detail, figures = printing.detail, options.figure_files(formats)
+    members = batch_members(scenes, Path(), sweep, *changes.both)
+    output.warn_all(batch_warnings(members))
+    with output.batch_bars(len(members), printing.quiet) as bars:
+        predicted = partial(stages.predict_scene, rays=not no_rays)
+        batch = Batch(predicted, bars.observer, lambda _, description: description)
+        files = BatchFiles(folder, None, figures)
+        outcome = run_batch(batch, members, failures.report, progress=bars.progress, files=files, with_folders=False)
+    sections = predicted_sections(members, outcome, detail)
+    if detail == "verdict":
+        output.print_lines(predicted_lines(outcome.documents))
+    failures.finish_batch(replace(outcome, sections=sections), printing.as_json)
+
+
+def design(
+    scene: SceneFile,
+    changes: Changes,
+    steer: Steer = "",
+    folder: FolderIfAny = None,
+    formats: Formats = "",
+    as_json: Json = False,
+) -> None:
+    """Choose the best camera of the lens types of [design], with a bound on every other choice."""
+    from ommatid.pipeline.design import prove_best_camera, steer_windows
+    from ommatid.scenes.scene import read
+
+    figures = options.figure_files(formats)
+    described = read(scene, *changes.both)
+    title = described.title or scene.stem
+    with output.progress_bar("design") as progress:
+        if steer:
+            document, rows = steer_windows(described, steer, folder, figures)
+            title = f"{title}: windows of further sub-imagers"
+        else:
+            document, rows = prove_best_camera(described, folder, figures, progress)
+            title = f"{title}: the best camera"
+    output.print_result(document, [(title, rows)], as_json)

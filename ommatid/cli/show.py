@@ -28,8 +28,7 @@ Source = Annotated[
 def show(scene: SceneFile, changes: WorldChanges, printing: Printing, figure: FigureFile = None) -> None:
     """Show the camera in the terms of optics, and what is left out; with -v why, and the plan."""
     from ommatid.analysis import summary
-    from ommatid.pipeline.descriptions import describe_scene, focus_curves
-    from ommatid.pipeline.sections import scene_sections
+    from ommatid.pipeline.sections import describe_scene, focus_curves, scene_sections
     from ommatid.scenes.formats.picture import conversions
     from ommatid.scenes.scene import read
 
@@ -98,8 +97,7 @@ def schema(as_json: Json = False) -> None:
 
 def doctor(as_json: Json = False) -> None:
     """Test the rendering backends, and say how to repair them."""
-    from ommatid.pipeline.descriptions import describe_backends
-    from ommatid.pipeline.sections import backend_sections
+    from ommatid.pipeline.sections import backend_sections, describe_backends
 
     description = describe_backends()
     output.print_result(description, backend_sections(description), as_json, description["advice"])

@@ -5,12 +5,15 @@ Maps are (rows, columns). Their scales are common where they are equal: a bar th
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes.constants import WHITE
 
 MOST_SHOWN = 480  # rows and columns of a map that a panel of a screen can show
 
@@ -25,21 +28,33 @@ class FigureScale:
     label: str
 
     @classmethod
-    def grey(cls, image: FloatArray, aside: float = 0.0) -> FigureScale:
-        """Return the grey scale of the values of an image without `aside` per cent of them at either end."""
-        low, high = (float(end) for end in np.nanpercentile(image, (aside, 100 - aside)))
+    def grey(cls, *images: NDArray[Any], aside: float = 0.0) -> FigureScale:
+        """Return the grey scale of the values of images without `aside` per cent of them at either end."""
+        low, high = _range(images, aside) or (0.0, WHITE)
         return cls(*((low, high) if high > low else (low - 0.5, high + 0.5)), "gray", "grey level (0 to 255)")
 
     @classmethod
-    def signed(cls, error: FloatArray) -> FigureScale:
-        """Return a scale with zero in its middle."""
-        high = float(np.nanmax(np.abs(error))) or 1.0
+    def signed(cls, *errors: NDArray[Any], aside: float = 0.0) -> FigureScale:
+        """Return a scale with zero in its middle, without `aside` per cent of the largest errors."""
+        high = (_range([np.abs(error) for error in errors], aside) or (0.0, 0.0))[1] or 1.0
         return cls(-high, high, "RdBu_r", "error (grey levels)")
 
     @classmethod
     def positive(cls, high: float, label: str) -> FigureScale:
         """Return a scale from zero."""
         return cls(0.0, high or 1.0, "viridis", label)
+
+    @classmethod
+    def deviation(cls, *deviations: NDArray[Any], aside: float = 0.0) -> FigureScale:
+        """Return the scale of standard deviations, without `aside` per cent of the largest."""
+        return cls.positive((_range(deviations, aside) or (0.0, 0.0))[1], "standard deviation (grey levels)")
+
+
+def _range(images: Iterable[NDArray[Any]], aside: float) -> tuple[float, float] | None:
+    """Return the range of all images, each without `aside` per cent of its values at either end; None without any."""
+    known = [image[np.isfinite(image)] for image in images]
+    ends = [np.percentile(values, (aside, 100 - aside)) for values in known if values.size]
+    return (float(min(low for low, _ in ends)), float(max(high for _, high in ends))) if ends else None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""index.html of a batch: the error of every scene, failures with their reasons, and measured against predicted error.
+"""index.html of a batch: the error of every scene, and failures with their reasons.
 
 A sweep is a batch with `sweep.json`, which lists its folders with the `values` of the varied keys.
 """
@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from math import sqrt
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from markupsafe import Markup
-
 from ommatid.batch.film import Film
-from ommatid.batch.sweep_row import NUMBERS, SweepRow, read_rows
+from ommatid.batch.sweep_row import NUMBERS, read_rows
 from ommatid.batch.sweep_table import PICTURE as SWEEP_PICTURE
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.facts import agreement
@@ -32,8 +30,7 @@ from ommatid.scenes.camera import derive
 from ommatid.scenes.geometry.optical_terms import optical_terms
 from ommatid.scenes.scene import read as read_scene
 
-from .cached import REPORT, read_stamp, sources_digest
-from .panels.charts import ChartAxis, ChartSeries, chart
+from .cached import REPORT, check_own_page, read_stamp, sources_digest
 
 INDEX = "index.html"
 COLUMNS = (
@@ -73,43 +70,20 @@ class BatchEntry:
         """Title of the scene, or the name of its folder."""
         return printable((self.report.title if self.report else "") or self.name)
 
-    @property
-    def agreement(self) -> str:
-        """Agreement of the measured error with the expected interval, as `agreement` of `words` returns it."""
-        return agreement(self.report.error) if self.report else "unknown"
-
-    @property
-    def heading(self) -> str:
-        """The verdict in two or three words."""
-        return heading(self.report) if self.report else ""
-
-    @property
-    def level(self) -> str:
-        """The level of the verdict, empty where it is not known."""
-        return self.report.verdict.level if self.report else ""
-
-    @property
-    def root(self) -> float | None:
-        """Measured RMS error, None if the truth is not known."""
-        return None if self.report is None or self.report.error.mse is None else sqrt(self.report.error.mse)
-
-    @property
-    def seconds(self) -> float:
-        """Run time of all stages."""
-        return self.report.seconds if self.report else 0.0
-
 
 def cached_index(output: Path, folders: Mapping[Path, str]) -> bool:
     """Write index.html of a batch unless it is up to date or there is no folder, and return True if it was written.
 
     folders : of the batch, in order, each with its failure or an empty text; other runs in `output` follow
-    Raises MachineError for a full disk, and InputError as `check_index` does.
+    Raises MachineError for a full disk, and InputError as `check_own_page` does.
     """
     if not output.is_dir():
         return False
-    check_index(output)
+    check_own_page(output / INDEX)
     others = sorted(path.parent for path in output.glob(f"*/{REPORT}") if path.parent not in folders)
-    values = {Path(row.folder or "").name: row.values for row in read_sweep(output / NUMBERS)}
+    values = dict[str, Mapping[str, Any]]()
+    with suppress(InputError):  # there is no sweep.json, or a damaged one
+        values = {Path(row.folder or "").name: row.values for row in read_rows(output / NUMBERS)}
     entries = [
         replace(_entry(folder, folders.get(folder, "")), values=values.get(folder.name, {}))
         for folder in (*folders, *others)
@@ -138,15 +112,6 @@ def write_film_index(output: Path, reports: Sequence[tuple[str, RunReport | None
     return output / INDEX
 
 
-def check_index(output: Path) -> None:
-    """Raise InputError if a page of another program would be replaced by the index of a batch."""
-    path = output / INDEX
-    if path.is_file() and not path.is_symlink() and path.stat().st_size and read_stamp(path)[1] is None:
-        raise InputError(
-            f"{path}: would be replaced, but is a page of another program; move it, or choose another folder with -o"
-        )
-
-
 def _entry(folder: Path, failure: str) -> BatchEntry:
     if failure:
         return BatchEntry(folder.name, failure=failure)
@@ -172,16 +137,8 @@ def url(folder: str, file: str) -> str:
     return quote(os.fsencode(f"{Path(folder).name}/{file}"))
 
 
-def read_sweep(path: Path) -> list[SweepRow]:
-    """Return the rows of sweep.json, none if the file is missing or damaged."""
-    try:
-        return read_rows(path)
-    except InputError:
-        return []
-
-
 def page(entries: list[BatchEntry], stamp: str, noun: str = "scenes", **content: Any) -> str:
-    """Return the index as HTML; without figures if there is nothing to compare.
+    """Return the index as HTML.
 
     noun : what the entries are;  content : its `title`; `sweep_picture`, file of the figure of the sweep; `film`
     """
@@ -191,8 +148,9 @@ def page(entries: list[BatchEntry], stamp: str, noun: str = "scenes", **content:
         "entries": entries,
         "keys": list(dict.fromkeys(key for entry in entries for key in entry.values)),
         "columns": COLUMNS,
+        "heading": heading,
+        "agreement": agreement,
         "words": words(entries, noun),
-        "figure": _scenes_figure(entries),
     }
     of_page: dict[str, Any] = {"noun": noun, "document": "", "stamp": stamp, "film": None, "sweep_picture": ""}
     return fill("index.html", {**of_page, **of_batch, **content}, "index.js")
@@ -202,32 +160,12 @@ def words(entries: list[BatchEntry], noun: str = "scenes") -> str:
     """Return the results of the batch in one sentence; noun : what the entries are."""
     finished = [entry for entry in entries if not entry.failure]
     sentence = f"{len(finished)} of {len(entries)} {noun} are finished"
-    distrusted = [entry.title for entry in finished if entry.heading == "not to be trusted"]
+    reports = [entry.report for entry in finished if entry.report is not None]
+    distrusted = [entry.title for entry in finished if entry.report is not None and not entry.report.verdict.trusted]
     if distrusted:
         sentence += f"; not to be trusted: {', '.join(distrusted)}"
-    agreements = [entry.agreement for entry in finished if entry.agreement != "unknown"]
+    agreements = [found for report in reports if (found := agreement(report.error)) != "unknown"]
     if agreements:
         inside = agreements.count("agrees")
         sentence += f"; the error of {inside} of {len(agreements)} is inside the 99 % interval expected for its image"
     return f"{sentence}."
-
-
-def _scenes_figure(entries: list[BatchEntry]) -> Markup:
-    """Draw measured against predicted error; nothing if there is nothing to compare."""
-    errors = [entry.report.error for entry in entries if entry.report]
-    points = [(each.predicted_mse, each.mse, each.expected_given_truth) for each in errors if each.predicted_mse]
-    points = [(predicted, measured, given) for predicted, measured, given in points if measured]
-    if len(points) < 2:
-        return Markup("")
-    dots = ChartSeries(
-        "measured, with the 99 % interval expected for the image",
-        [predicted for predicted, _, _ in points],
-        [measured for _, measured, _ in points],
-        "dots",
-        low=[measured if given is None else given.low for _, measured, given in points],
-        high=[measured if given is None else given.high for _, measured, given in points],
-    )
-    ends = [min(dots.x), max(dots.x)]
-    equal = ChartSeries("measured equals predicted", ends, ends, "dashed", 0)
-    x, y = (ChartAxis(f"{name} mean squared error", True) for name in ("predicted", "measured"))
-    return chart("scenes", x, y, [equal, dots], "measured against predicted error of the scenes")

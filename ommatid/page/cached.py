@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ommatid.bench.table import bench_tables
 from ommatid.reconstruct.output.run_json import RunReport
+from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import cached, fingerprint, write_text
 from ommatid.runtime.input_files import open_input
 from ommatid.scenes import stack
@@ -19,7 +20,7 @@ from .data import read_run
 
 REPORT = "report.html"
 HERE = Path(__file__).parent
-DRAWN = HERE.parent / "analysis" / "quality", HERE.parent / "figures"  # folders of what the pages draw
+FIGURES = HERE.parent / "figures"  # what the pages draw
 HEAD, TAIL = 4096, 64  # bytes at the beginning of a page that contain its stamp, and at its end
 
 
@@ -56,11 +57,18 @@ def read_stamp(path: Path) -> tuple[None, str | None]:
     return None, match[1].decode() if match and end.rstrip().endswith(b"</html>") else None
 
 
+def check_own_page(path: Path) -> None:
+    """Raise InputError if a page of another program would be replaced by one of this program."""
+    if path.is_file() and not path.is_symlink() and path.stat().st_size and read_stamp(path)[1] is None:
+        raise InputError(
+            f"{path}: would be replaced, but is a page of another program; move it, or choose another folder with -o"
+        )
+
+
 def sources_digest() -> str:
     """Return the SHA-256 of the modules and templates of the pages: a new version redraws the pages."""
     total = hashlib.sha256()
     sources = [*HERE.rglob("*.py"), *(HERE / "templates").iterdir()]
-    sources += [path for folder in DRAWN for path in folder.glob("*.py")]
-    for path in sorted(sources):
+    for path in sorted([*sources, *FIGURES.glob("*.py")]):
         total.update(path.read_bytes())
     return total.hexdigest()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from math import hypot, sqrt
 from pathlib import Path
 from typing import Any, cast
@@ -14,19 +15,15 @@ import numpy as np
 from ommatid.reconstruct.output import facts, verdict_words
 from ommatid.reconstruct.output.result_files import check_run_folder
 from ommatid.reconstruct.output.run_json import ErrorReport
-from ommatid.runtime.arrays import Float32Array
-from ommatid.runtime.errors import InputError
 from ommatid.runtime.files import make_folder, write_text
 from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.kinds import check_output
 from ommatid.scenes.scene import Scene
 
-from .cached import REPORT, read_stamp
-from .data import Run, block_of, read_run, reduced
+from . import maps
+from .cached import REPORT, check_own_page
+from .data import PageTable, Run, block_of, maps_of, read_run
 from .document import fill
-from .panels import maps
-from .panels.maps import ColourScale, Panel
-from .tables import PageTable
 
 COMPARISON = "comparison.html"
 NAMES = "A", "B"
@@ -45,8 +42,7 @@ def write_comparison(first: Path, second: Path, output: Path) -> Path:
     make_folder(output)
     path = output / COMPARISON
     check_output(path)
-    if path.is_file() and path.stat().st_size and read_stamp(path)[1] is None:
-        raise InputError(f"{path}: would be replaced, but is a page of another program; choose another folder with -o")
+    check_own_page(path)
     urls = [quote(os.fsencode(os.path.relpath(folder / REPORT, output))) for folder in (first, second)]
     write_text(path, page(*runs, urls))
     return path
@@ -83,7 +79,7 @@ def difference_words(first: Run, second: Run) -> list[str]:
             " reduce the error in any case."
         )
     for name, run in zip(NAMES, (first, second), strict=True):
-        if not verdict_words.is_trusted(run.report):
+        if not run.report.verdict.trusted:
             words.append(f"{name} is not to be trusted: its numbers rest on assumptions that do not hold.")
     return words
 
@@ -155,9 +151,17 @@ def _numbers(runs: tuple[Run, Run]) -> PageTable:
 
 
 def _pictures(runs: tuple[Run, Run]) -> dict[str, Any]:
-    """Return the maps of both runs, which move together where the images are equally large."""
-    block = max(block_of(run.estimate.shape, MAPS) for run in runs)
-    shown, shapes = _panels(runs, block), [run.estimate.shape for run in runs]
+    """Return the maps of both runs with common colours, which move together where the images are equally large."""
+    block, shapes = max(block_of(run.estimate.shape, MAPS) for run in runs), [run.estimate.shape for run in runs]
+    pictures = [maps_of(run, block) for run in runs]
+    scales = maps.scales_of(pictures)
+    shown = [
+        [
+            replace(panel, name=f"{panel.name}-{name}", title=f"{panel.title}, {name}", difference=None)
+            for panel in maps.panels(images, maps.TITLES, {}, scales)
+        ]
+        for name, images in zip(NAMES, pictures, strict=True)
+    ]
     if shapes[0] == shapes[1]:
         groups = [maps.group("maps", [*shown[0], *shown[1]], block, shapes[0])]
     else:
@@ -165,41 +169,11 @@ def _pictures(runs: tuple[Run, Run]) -> dict[str, Any]:
         groups = [maps.group(f"maps-{name}", panels, block, shape) for name, panels, shape in pairs]
     names = [groups[0]["name"], groups[-1]["name"]]
     by_name = {panel.name: panel for panels in shown for panel in panels}
-    kinds = dict.fromkeys(name.rpartition("-")[0] for name in by_name)
-    ratios = [maps.ratio(*shape) for shape in shapes]
     cells = [
-        (by_name.get(f"{kind}-{name}"), group, ratio)
-        for kind in kinds
-        for name, group, ratio in zip(NAMES, names, ratios, strict=True)
+        (by_name.get(f"{kind}-{name}"), group, maps.ratio(*shape))
+        for kind in maps.TITLES
+        if any(kind in images for images in pictures)
+        for name, group, shape in zip(NAMES, names, shapes, strict=True)
     ]
     tools = list(dict.fromkeys(names))
     return {"cells": cells, "block": block, "document": maps.document(groups), "group_names": tools}
-
-
-def _panels(runs: tuple[Run, Run], block: int) -> list[list[Panel]]:
-    """Return the panels of both runs, named by their kind and run, with common colours."""
-    pictures = [_maps(run, block) for run in runs]
-    grey = maps.grey_scale([each[kind] for each in pictures for kind in ("truth", "estimate") if kind in each])
-    error = maps.largest([np.abs(each["error"]) for each in pictures if "error" in each])
-    deviation = maps.largest([each["error bar"] for each in pictures])
-    scales = {
-        "truth": grey,
-        "estimate": grey,
-        "error": ColourScale("diverging", -error, error, "estimate minus truth"),
-        "error bar": ColourScale("sequential", 0.0, deviation, "posterior standard deviation"),
-    }
-    return [
-        [
-            Panel(f"{kind}-{name}", f"{kind.capitalize()}, {name}", image, scales[kind], "", maps.value_words(image))
-            for kind, image in each.items()
-        ]
-        for name, each in zip(NAMES, pictures, strict=True)
-    ]
-
-
-def _maps(run: Run, block: int) -> dict[str, Float32Array]:
-    """Return the pictures of a run as means over blocks, by kind."""
-    found = {"truth": run.truth, "estimate": run.estimate}
-    found["error"] = None if run.truth is None else run.estimate - run.truth
-    reduced_maps = {kind: reduced(image, block) for kind, image in found.items() if image is not None}
-    return {**reduced_maps, "error bar": np.sqrt(reduced(run.variance, block))}

@@ -5,7 +5,7 @@ Maps are (rows, columns) in the target's pixels, row 0 at the top; values are in
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import ceil, sqrt
 from pathlib import Path
@@ -55,27 +55,12 @@ class Run:
 
 
 @dataclass(frozen=True)
-class ResultMaps:
-    """Maps of a run as the page shows them: means over blocks of `block` x `block` pixels.
+class PageTable:
+    """A caption, the column headers, and rows whose first cell is the row header."""
 
-    deviation : posterior standard deviation of a pixel, the square root of the mean variance in a block
-    single : a sub-image on the grid of the image
-    others : images of other methods by name
-    """
-
-    rows: int
-    columns: int
-    block: int
-    estimate: Float32Array
-    deviation: Float32Array
-    truth: Float32Array | None
-    single: Float32Array
-    others: Mapping[str, Float32Array] = field(default_factory=dict[str, Float32Array])
-
-    @property
-    def error(self) -> Float32Array | None:
-        """Estimate minus truth, None if the truth is not known."""
-        return None if self.truth is None else self.estimate - self.truth
+    caption: str
+    header: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
 
 
 def read_run(
@@ -109,30 +94,25 @@ def _others(folder: Path, report: RunReport) -> Mapping[str, Float32Array]:
     return {} if known is None else {name: image for name, image in known.images.items() if name != "single"}
 
 
-def maps(
-    estimate: Float32Array,
-    variance: Float32Array,
-    truth: Float32Array | None,
-    single: FloatArray,
-    others: Mapping[str, Float32Array] | None = None,
-) -> ResultMaps:
-    """Return the maps of an estimate with at most MOST_PIXELS blocks (a few more with partial blocks at the edges)."""
-    rows, columns = estimate.shape
-    block = block_of(estimate.shape, MOST_MAPS + len(others or {}))
-    return ResultMaps(
-        rows=rows,
-        columns=columns,
-        block=block,
-        estimate=reduced(estimate, block),
-        deviation=np.sqrt(reduced(variance, block)),
-        truth=None if truth is None else reduced(truth, block),
-        single=reduced(single, block),
-        others={name: reduced(image, block) for name, image in (others or {}).items()},
-    )
+def maps_of(run: Run, block: int, single: FloatArray | None = None) -> dict[str, Float32Array]:
+    """Return the maps of a run by name, as means over blocks of `block` x `block` pixels, images of other methods last.
+
+    `deviation` is the posterior standard deviation of a pixel, the square root of the mean variance in a block.
+
+    single : a sub-image on the grid of the image, None to leave it out
+    """
+    found = {"truth": run.truth, "single": single, "estimate": run.estimate}
+    found["error"] = None if run.truth is None else run.estimate - run.truth
+    reduced_maps = {name: reduced(image, block) for name, image in found.items() if image is not None}
+    others = {name: reduced(image, block) for name, image in run.others.items()}
+    return {**reduced_maps, "deviation": np.sqrt(reduced(run.variance, block)), **others}
 
 
 def block_of(shape: tuple[int, ...], maps: int) -> int:
-    """Return the side of the blocks whose means a page of so many maps of (rows, columns) shows."""
+    """Return the side of the blocks whose means a page of so many maps of (rows, columns) shows.
+
+    There are at most MOST_PIXELS blocks, and a few more with partial blocks at the edges.
+    """
     most = MOST_PIXELS * MOST_MAPS / max(maps, MOST_MAPS)
     return max(1, ceil(sqrt(shape[0] * shape[1] / most)))
 

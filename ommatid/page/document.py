@@ -7,13 +7,11 @@ from collections.abc import Mapping
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
 from ommatid.runtime.printable import printable_lines
-
-from .documentation import documentation
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -57,5 +55,4 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["code"] = code
-    cast(dict[str, Any], environment.globals)["documentation"] = documentation
     return environment

@@ -20,21 +20,21 @@ from ommatid.batch.remote import RunObserver, SceneOutcome, ScenePackage, Stages
 from ommatid.batch.sweep_row import summary
 from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
-from ommatid.page.batch_index import cached_index, check_index
+from ommatid.page.batch_index import INDEX, cached_index
+from ommatid.page.cached import check_own_page
 from ommatid.runtime.errors import InputError, MachineError, NotStartedError
-from ommatid.runtime.execution.cluster import Cluster
-from ommatid.runtime.execution.pool import check_options, worker_pool
-from ommatid.runtime.execution.workers import Completed
+from ommatid.runtime.execution.cluster import Cluster, worker_pool
 from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import new_folder, occupied
 from ommatid.runtime.printable import printable_sentence
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.formats import picture
 
-from .stages import library_versions, open_member, process_count
+from .stages import library_versions, open_member
 
-# Each scene with a function that returns its description, or raises its error.
-Runs = Generator[tuple[Member, Callable[[], Description]]]
+# Each scene with a function that returns its outcome, or raises its error.
+Runs = Generator[tuple[Member, Callable[[], SceneOutcome]]]
+Facts = Callable[[], dict[str, str]]
 
 
 @dataclass
@@ -60,7 +60,7 @@ class BatchFiles:
             if folder is not None:
                 check_folder(folder)
         if self.index is not None:
-            check_index(self.index)
+            check_own_page(self.index / INDEX)
 
 
 def batch_members(
@@ -119,63 +119,51 @@ class Batch:
     report: Callable[[Member, Description], Description]
 
     def run(self, members: Sequence[Member], cluster: Cluster | None = None, count: int | None = None) -> Runs:
-        """Yield every scene with a function that returns its description or raises its error.
+        """Yield every scene as it ends, with a function that returns its outcome or raises its error.
 
         Scenes run in `count` processes or on `cluster`; without either, in as many processes as
         finish soonest, given the scenes, processors and memory. A single process is this one, which shows progress.
+        If processes or the connection are lost, the first of the scenes that are left says so for all of them.
         """
-        check_options(cluster, count)
-        if cluster is not None:
-            yield from self._on_cluster(members, cluster)
-            return
-        count = min(process_count(members) if count is None else count, len(members))
-        work = partial(_run_member, self.stages, None if count > 1 else self.observe)
-        with worker_pool(count=count) as pool:
-            yield from self._collected(pool.each(work, members), members)
+        requirement = None
+        if cluster is None:
+            if count is None and len(members) > 1:
+                from ommatid.batch.plan import process_count
 
-    def _on_cluster(self, members: Sequence[Member], cluster: Cluster) -> Runs:
-        """Yield scenes with errors that show already here, then the others as they end."""
-        waiting: list[Member] = []
-        auto_variant = False
-        for member in members:
+                count = process_count(members)
+            count = min(count or 1, len(members))
+            work = partial(_run_member, self.stages, None if count > 1 else self.observe)
+            items: Iterable[Any] = members
+        else:
+            members, failed, requirement = _sendable(members)
+            yield from failed
+            work = partial(carry_out, self.stages)
+            items = map(_packed, members)  # as workers become free: all images might not fit into memory
+        if not members:
+            return
+        waiting = dict(enumerate(members))
+        with worker_pool(cluster, count) as pool:
+            if requirement is not None:
+                pool.check_versions(requirement)
             try:
-                setup = open_member(member)
-                check_files(setup, member.folder)
-                with new_folder(member.folder):  # fails before any work if there can be none
-                    waiting.append(member)
-            except Exception as error:
-                yield member, partial(_raise, error)
-                continue
-            auto_variant |= setup.scene.render.variant == "auto"
-        if not waiting:
-            return
-        with worker_pool(cluster) as pool:
-            pool.check_versions(partial(library_versions, auto_variant))
-            packages = map(_packed, waiting)  # as workers become free: all images might not fit into memory
-            yield from self._collected(pool.each(partial(carry_out, self.stages), packages), waiting)
+                for index, outcome in pool.each(work, items):
+                    yield waiting.pop(index), outcome
+                return
+            except MachineError as error:
+                loss = error
+        first, *others = waiting.values()
+        more = f" and {len(others)} more" if others else ""
+        yield first, partial(SceneOutcome, error=MachineError(f"{first.scene}{more}: {loss}"))
+        for member in others:
+            yield member, partial(SceneOutcome, error=NotStartedError(f"{member.scene}: {loss}"))
 
-    def _collected(self, tasks: Iterable[Completed[SceneOutcome]], members: Sequence[Member]) -> Runs:
-        """Yield the scenes of tasks as they end, then those left over if connection or processes are lost."""
-        waiting = dict.fromkeys(range(len(members)))
-        failed: dict[Member, Exception] = {}
-        try:
-            for ended in tasks:
-                if ended.loss is not None:
-                    raise ended.loss
-                del waiting[ended.index]
-                yield members[ended.index], partial(self._collect, members[ended.index], ended)
-        except MachineError as error:
-            failed = _unfinished([members[index] for index in waiting], error)
-        for member, error in failed.items():
-            yield member, partial(_raise, error)
-
-    def _collect(self, member: Member, ended: Completed[SceneOutcome]) -> Description:
+    def collect(self, member: Member, finished: Callable[[], SceneOutcome]) -> Description:
         """Write the files that a worker returned, and report its stages. Raises the worker's error.
 
         A scene that was refused leaves no files.
         """
         try:
-            outcome = ended.result()
+            outcome = finished()
         except MachineError as error:
             raise MachineError(f"{member.scene}: {error}") from error
         if (outcome.files or outcome.removed) and (outcome.done or not isinstance(outcome.error, InputError)):
@@ -191,16 +179,28 @@ class Batch:
 
 def _run_member(stages: Stages, observe: Callable[[Path], RunObserver] | None, member: Member) -> SceneOutcome:
     """Run a scene, which reads its files and writes to its folder; `observe` sees it, None in another process."""
+    observer = None if observe is None else observe(member.folder)
+    return outcome_of(lambda observer: stages(open_member(member), member.folder, observer), observer)
 
-    def work(observer: RunObserver) -> Description:
-        return stages(open_member(member), member.folder, observer)
 
-    if observe is None:
-        return outcome_of(work)
-    try:
-        return SceneOutcome({}, {}, work(observe(member.folder)))
-    except Exception as error:
-        return SceneOutcome({}, {}, {}, error)
+def _sendable(members: Sequence[Member]) -> tuple[list[Member], list[tuple[Member, Callable[[], SceneOutcome]]], Facts]:
+    """Return the scenes that can be sent, those with errors that show already here, and what workers have to agree on.
+
+    A folder that cannot be made is found before any work.
+    """
+    sendable, failed = list[Member](), list[tuple[Member, Callable[[], SceneOutcome]]]()
+    auto_variant = False
+    for member in members:
+        try:
+            setup = open_member(member)
+            check_files(setup, member.folder)
+            with new_folder(member.folder):
+                sendable.append(member)
+        except Exception as error:
+            failed.append((member, partial(SceneOutcome, error=error)))
+            continue
+        auto_variant |= setup.scene.render.variant == "auto"
+    return sendable, failed, partial(library_versions, auto_variant)
 
 
 def _packed(member: Member) -> ScenePackage | SceneOutcome:
@@ -208,21 +208,7 @@ def _packed(member: Member) -> ScenePackage | SceneOutcome:
     try:
         return packed(open_member(member), member.folder)
     except Exception as error:  # a file was removed since it was checked
-        return SceneOutcome({}, {}, {}, error)
-
-
-def _unfinished(members: Sequence[Member], error: MachineError) -> dict[Member, Exception]:
-    """Return an error for each scene that is left when a cluster or a process fails; the first counts the others."""
-    if not members:
-        return {}
-    first, *others = members
-    count = f" and {len(others)} more" if others else ""
-    failures: dict[Member, Exception] = {first: MachineError(f"{first.scene}{count}: {error}")}
-    return failures | {member: NotStartedError(f"{member.scene}: {error}") for member in others}
-
-
-def _raise(error: Exception) -> Description:
-    raise error
+        return SceneOutcome(error=error)
 
 
 def run_batch(
@@ -245,10 +231,10 @@ def run_batch(
     results: dict[Member, Description] = {}
     failures: dict[Path, str] = {}
     codes = [0]
-    for number, (member, work) in enumerate(batch.run(members, cluster, workers), 1):
+    for number, (member, finished) in enumerate(batch.run(members, cluster, workers), 1):
         document = _heading(member, with_folders)
         try:
-            results[member] = {**document, **work()}
+            results[member] = {**document, **batch.collect(member, finished)}
         except Exception as error:
             codes.append(report_failure(error))
             reason = printable_sentence(error)

@@ -8,7 +8,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter
 
 from ommatid.analysis.baselines import missing_methods
@@ -22,8 +21,7 @@ from ommatid.reconstruct.output.result_files import Region
 from ommatid.reconstruct.output.run_json import RUN, HeldOutReport, RunReport
 from ommatid.reconstruct.restore import check_camera
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.execution.cluster import Cluster
-from ommatid.runtime.execution.pool import check_options, worker_pool
+from ommatid.runtime.execution.cluster import Cluster, worker_pool
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.files import file_digest, write_whole
 from ommatid.runtime.input_files import read_text, real_path
@@ -68,7 +66,6 @@ def reconstruct_files(
     Returns the content of run.json, with the means of the regions.
     Raises InputError for wrong files and options, and for other files in the way, MachineError for a full disk.
     """
-    check_options(cluster, workers)
     check_output(output, stack, options.model, *(stack.parent / name for name in (TRUTH, WORLD_PICTURE)))
     check_output(output.with_suffix(".png"))
     check_picture(output)
@@ -91,28 +88,35 @@ def reconstruct_folder(
     Returns the content of run.json, and False if it was up to date. Raises InputError for wrong files and options, also
     for a folder that holds the stack or the model, and MachineError for a full disk.
     """
-    check_options(cluster, workers)
-    recorded, calibrated = options.read(stack)
-    check_camera(recorded.camera, calibrated, (stack, options.model))
     sources = {real_path(path) for path in (stack, options.model, stack.parent / TRUTH)}
     for name in (STACK, MODEL, TRUTH, WORLD_PICTURE):
         if real_path(folder / name) in sources:
             raise InputError(f"{folder / name}: would replace a file that is read; choose another folder with -o")
     with occupied(folder, result_files.ESTIMATE):
-        _remove_other_scene(folder, recorded)
-        if result_files.truth_beside(stack, recorded) is not None:
-            for name in (TRUTH, WORLD_PICTURE):
-                _copy(stack.parent / name, folder / name)
-        if options.changes or options.lenses:
-            stack_file.write(folder / STACK, recorded)
-        else:
-            _copy(stack, folder / STACK)
-        if options.lenses:
-            model_file.write(folder / MODEL, calibrated)
-        else:
-            _copy(options.model, folder / MODEL)
+        _fill(folder, stack, options)
         with _tile_workers(cluster, workers) as pool:
             return finish_folder(folder, progress, options.regions, pool, options.force)
+
+
+def _fill(folder: Path, stack: Path, options: FrameOptions) -> None:
+    """Copy a stack, its model and its truth into a folder, stack and model as `options` change them.
+
+    Raises InputError for wrong files and options.
+    """
+    recorded, calibrated = options.read(stack)
+    check_camera(recorded.camera, calibrated, (stack, options.model))
+    _remove_other_scene(folder, recorded)
+    if result_files.truth_beside(stack, recorded) is not None:
+        for name in (TRUTH, WORLD_PICTURE):
+            _copy(stack.parent / name, folder / name)
+    if options.changes or options.lenses:
+        stack_file.write(folder / STACK, recorded)
+    else:
+        _copy(stack, folder / STACK)
+    if options.lenses:
+        model_file.write(folder / MODEL, calibrated)
+    else:
+        _copy(options.model, folder / MODEL)
 
 
 def check_held_out_files(stack: Path, options: FrameOptions, *, fitted: bool, progress: Progress) -> HeldOutReport:
@@ -141,13 +145,11 @@ def finish_folder(
     report, made = result_files.cached_results(
         folder, recorded, calibrated, names, progress, workers, tuple(regions), force
     )
-    report = _with_design(report, recorded.scene)
     earlier = earlier_report(folder, report.fingerprint)
-    if not made and earlier is not None:  # of a run, which says more
-        report = earlier.of_stages()
-    files = max(perf_counter() - begun - report.stages["reconstruct"].seconds, 0.0)
-    results = StageResults(report, recorded, calibrated, made, files)
-    return finish(results, folder, SILENT), made
+    if earlier is None:
+        files = max(perf_counter() - begun - report.stages["reconstruct"].seconds, 0.0)
+        report = _with_design(report, recorded.scene).with_times(files, None)
+    return finish(StageResults(earlier or report, recorded, calibrated), folder, SILENT), made
 
 
 def _design_instead(report: RunReport, scene: Scene) -> str:
@@ -180,7 +182,7 @@ def _write_page(folder: Path) -> None:
     truth = result_files.truth_beside(folder / STACK, recorded)
     if report.fingerprint != result_files.fingerprint_of(recorded, calibrated, truth, regions):
         raise InputError(f"{folder}: run.json is of another stack or model than those beside it; run the scene again")
-    write_page(StageResults(report, recorded, calibrated, made=False, files=0.0), folder, SILENT)
+    write_page(StageResults(report, recorded, calibrated), folder, SILENT)
 
 
 @dataclass(frozen=True)
@@ -260,18 +262,14 @@ def _report(path: Path, output: Path | None, progress: Progress) -> ReportOutcom
 
 def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcome:
     """Reconstruct a stack with the model beside it, or with H as designed, and write the page."""
-    model = stack.with_name(MODEL)
-    if real_path(folder) == real_path(stack.parent):
-        with occupied(folder, result_files.ESTIMATE):
-            warnings = () if model.is_file() else (_write_designed_model(stack, model, progress),)
-            finish_folder(folder, progress)
-        return ReportOutcome((folder,), None, warnings or _design_warnings(folder))
-    with TemporaryDirectory(prefix="ommatid-") as scratch:
-        warnings = ()
+    model, warnings = stack.with_name(MODEL), ()
+    with occupied(folder, result_files.ESTIMATE):
         if not model.is_file():
-            model = Path(scratch) / MODEL
+            model = folder / MODEL
             warnings = (_write_designed_model(stack, model, progress),)
-        reconstruct_folder(stack, FrameOptions(model), folder, progress)
+        if real_path(folder) != real_path(stack.parent):
+            _fill(folder, stack, FrameOptions(model))
+        finish_folder(folder, progress)
     return ReportOutcome((folder,), None, warnings or _design_warnings(folder))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,9 +14,9 @@ from ommatid.batch.remote import RunObserver, Stages
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.estimate_formats import Format, write_formats
-from ommatid.reconstruct.output.run_json import FILES, PAGE, RunReport
+from ommatid.reconstruct.output.run_json import PAGE, RunReport
 from ommatid.runtime.errors import InputError, naming_source
-from ommatid.runtime.machine import one_thread, processors
+from ommatid.runtime.machine import one_thread
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
@@ -34,18 +34,11 @@ from ommatid.simulate.validation import check_scene, check_scene_memory
 
 @dataclass(frozen=True)
 class StageResults:
-    """What the stages of a run made or found in its folder.
-
-    made : True if the estimate was made;  files : seconds of the stages for reading, checking and writing files
-    start_up : seconds from the start of the process to the first stage, None where it ran other scenes, too
-    """
+    """What the stages of a run made or found in its folder; `report` has the time of the page once it is written."""
 
     report: RunReport
     stack: Stack
     model: Model
-    made: bool
-    files: float
-    start_up: float | None = None
 
 
 def open_scene(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
@@ -69,33 +62,23 @@ def open_member(member: Member) -> Setup:
     return checked_setup(member.content)
 
 
-def process_count(members: Sequence[Member]) -> int:
-    """Return the number of processes that finishes a batch soonest, of as many as fit into memory."""
-    from ommatid.batch.plan import concurrent_by_memory, estimate_cost, fastest_process_count
+def run(setup: Setup, folder: Path, observer: RunObserver, force: bool = False) -> dict[str, Any]:
+    """Execute all stages of a scene, here or on a worker, and return the content of run.json.
 
-    if min(len(members), processors()) < 2:
-        return 1
-    costs = [estimate_cost(member) for member in members]
-    most = min(concurrent_by_memory([cost.memory for cost in costs]), len(members), processors())
-    return fastest_process_count([cost.seconds for cost in costs], most, processors())
-
-
-def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
-    """Execute all stages of a scene, here or on a worker, and return the content of run.json."""
-    return finish(results(setup, folder, observer), folder, observer).plain()
+    force : True to make again what is up to date
+    """
+    return finish(results(setup, folder, observer, force), folder, observer).plain()
 
 
 @dataclass(frozen=True)
 class SceneWork:
     """Stages, and what else is done with a scene, even if its results are up to date, by one process at a time.
 
-    force : check of the stages, before results of an earlier run are removed; None: what is up to date stays
     formats : of the estimate;  figures : files of the figures;  baselines : True to compare with other methods
     A scene that is refused before it is rendered leaves nothing in its folder.
     """
 
     stages: Stages
-    force: Callable[[Setup, Path], None] | None = None
     formats: tuple[Format, ...] = ()
     figures: FigureFiles = SCREEN_PNG
     baselines: bool = False
@@ -103,9 +86,6 @@ class SceneWork:
     def __call__(self, setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
         """Do the work, here or on a worker, and return the description."""
         with occupied(folder, RENDERED):
-            if self.force is not None:
-                self.force(setup, folder)
-                clear_results(folder, setup)
             description = self.stages(setup, folder, observer)
             if self.baselines:
                 with observer.progress("baselines") as progress:
@@ -145,9 +125,7 @@ def add_baselines(folder: Path, progress: Progress) -> RunReport:
     files = stack.read(folder / "stack.exr"), model_file.read(folder / "model.npz")
     found = cached_baselines(folder, report.fingerprint, *files, truth.astype("float64"), progress)
     if found.reports != report.baselines:
-        report = report.with_changes(baselines=found.reports)
-        write_page(StageResults(report, *files, made=False, files=0.0), folder, SILENT)
-        run_json.write(folder, report)
+        report = finish(StageResults(report.with_changes(baselines=found.reports), *files), folder, SILENT)
     return report
 
 
@@ -166,20 +144,16 @@ def check_run(setup: Setup, folder: Path) -> None:
     check_files(setup, folder)
 
 
-def check_render(setup: Setup, folder: Path) -> None:
-    """Raise InputError for what would stop a rendering of a scene after some work. Nothing is written."""
-    check_scene(setup, calibrates=False)
-    check_files(setup, folder)
-
-
 @one_thread()
-def results(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
-    """Execute all stages of a scene but write neither its page nor run.json."""
+def results(setup: Setup, folder: Path, observer: RunObserver, force: bool = False) -> StageResults:
+    """Execute all stages of a scene but write neither its page nor run.json; force : to make them all again."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.reconstruct.output.result_files import cached_results
 
     scene, camera = setup.scene, setup.camera
     check_run(setup, folder)
+    if force:
+        clear_results(folder, setup)
     start_up, begun = None if observer.start_up is None else observer.start_up(), perf_counter()
     stack, rendered = _rendered(setup, folder, observer)
     with observer.progress("calibrate") as progress:
@@ -190,26 +164,26 @@ def results(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
     observer.done("reconstruct", made)
     worked = {"render": rendered, "calibrate": calibrated, "reconstruct": made}
     files = perf_counter() - begun - sum(report.stages[name].seconds for name, ran in worked.items() if ran)
-    if scene.world is not None:
+    earlier = earlier_report(folder, report.fingerprint)
+    report = report if earlier is None else earlier
+    if earlier is None and scene.world is not None:
         from ommatid.analysis.depth_error import depth_error_of_run
 
         report = report.with_changes(depth=depth_error_of_run(folder, camera))
     if scene.study is not None:
         report = _with_study(report, setup, stack, folder, observer)
-    return StageResults(report, stack, model, made, max(files, 0.0), start_up)
+    if earlier is None:
+        report = report.with_times(max(files, 0.0), start_up)
+    return StageResults(report, stack, model)
 
 
 def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunReport:
-    """Write the page and run.json of results, and return its content. Where nothing was made, earlier times stay."""
-    begun, earlier = perf_counter(), earlier_report(folder, results.report.fingerprint)
-    if earlier is not None:
-        results = replace(results, report=results.report.with_changes(baselines=earlier.baselines))
+    """Write the page and run.json of results unless they are up to date, and return its content."""
+    begun, report = perf_counter(), results.report
     write_page(results, folder, observer)
-    times = results.files, perf_counter() - begun, results.start_up
-    if earlier is not None and not results.made:
-        files, page = (earlier.stages[name].seconds if name in earlier.stages else 0.0 for name in (FILES, PAGE))
-        times = files, page, earlier.spent.start_up
-    report = results.report.with_times(*times)
+    if PAGE not in report.stages:
+        report = report.with_stage(PAGE, perf_counter() - begun)
+    earlier = earlier_report(folder, report.fingerprint)
     if earlier is None or report.plain() != earlier.plain():
         run_json.write(folder, report)
     return report
@@ -232,8 +206,12 @@ def write_page(results: StageResults, folder: Path, observer: RunObserver) -> No
     observer.done("report", made)
 
 
-def render(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
-    """Render a scene, here or on a worker, and describe its stack."""
+def render(setup: Setup, folder: Path, observer: RunObserver, force: bool = False) -> dict[str, Any]:
+    """Render a scene, here or on a worker, and describe its stack; force : to render it again."""
+    check_scene(setup, calibrates=False)
+    check_files(setup, folder)
+    if force:
+        clear_results(folder, setup)
     stack, _ = _rendered(setup, folder, observer)
     return {"sub_images": len(setup.camera.sub_imagers), **stack.record}
 
@@ -249,19 +227,19 @@ def predict_scene(setup: Setup, folder: Path, observer: RunObserver, rays: bool 
     return {**json_of(prediction), **({} if light is None else {"light": light})}
 
 
-def calibrated_model(setup: Setup, path: Path, progress: Progress) -> tuple[Model, bool]:
+def calibrated_model(setup: Setup, path: Path, progress: Progress, stack: Stack | None = None) -> tuple[Model, bool]:
     """Return the model at `path` and False if it is up to date; else calibrate it, and True.
 
-    An adaptive calibration stops by the expected error of images drawn from the prior.
+    An adaptive calibration stops by the expected error of `stack`, without one by that of images drawn from the prior.
     """
     if setup.scene.calibration.method != "ideal":
         check_scene(setup)
     check_scene_memory(setup)
     stopping_rule = None
     if is_adaptive(setup.scene):
-        from ommatid.analysis.calibration_goal import for_prior
+        from ommatid.analysis.calibration_goal import for_prior, for_stack
 
-        stopping_rule = for_prior(setup)
+        stopping_rule = for_prior(setup) if stack is None else for_stack(stack)
     return cached_model(path, setup, progress, stopping_rule)
 
 
@@ -293,7 +271,6 @@ def library_versions(with_variant: bool) -> dict[str, str]:
 
 
 def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> tuple[Stack, bool]:
-    check_scene(setup, calibrates=False)
     prepare(setup, folder)
     with observer.progress("render") as progress:
         stack, made = cached_stack(folder / "stack.exr", setup, progress)
@@ -302,19 +279,16 @@ def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> tuple[Stack,
 
 
 def _with_study(report: RunReport, setup: Setup, stack: Stack, folder: Path, observer: RunObserver) -> RunReport:
-    """Add the errors with every model of H that the scene's study names, from run.json if they are up to date."""
+    """Add the errors with every model of H that the scene's study names, unless the report has them."""
     from ommatid.analysis.calibration_goal import for_stack
     from ommatid.analysis.study import study_cases, study_models
     from ommatid.reconstruct.output.result_files import truth_beside
 
-    known, begun = earlier_report(folder, report.fingerprint), perf_counter()
-    models = study_models(setup, folder, no_progress, for_stack(stack))
-    made = known is None or [case.model for case in known.study] != list(models)
-    if known is None or made:
+    begun, models = perf_counter(), study_models(setup, folder, no_progress, for_stack(stack))
+    made = [case.model for case in report.study] != list(models)
+    if made:
         with observer.progress("study") as progress:
             cases = study_cases(stack, models, truth_beside(folder / "stack.exr", stack), progress)
-        seconds = perf_counter() - begun
-    else:
-        cases, seconds = known.study, known.stages["study"].seconds
+        report = report.with_changes(study=cases).with_stage("study", perf_counter() - begun)
     observer.done("study", made)
-    return report.with_changes(study=cases).with_stage("study", seconds)
+    return report

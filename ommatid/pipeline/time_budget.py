@@ -7,13 +7,12 @@ interruption the next command goes on from what is there.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
 
-from ommatid.batch.batch import Member
-from ommatid.batch.remote import RunObserver, Stages
+from ommatid.batch.remote import RunObserver
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.run_json import STAGES, RequestedTime, TimeReport
 from ommatid.runtime.errors import InputError
@@ -39,91 +38,58 @@ Clock = Callable[[], float]
 Samples = int | Literal["auto"]
 
 
-def stages_within(
-    seconds: float,
-    members: Sequence[Member],
-    started: float,
-    say: Callable[[str], None],
-    scheduler: str = "",
-    workers: int | None = None,
-) -> Stages:
-    """Choose the stages of `run` for scenes that have a time together, and run one after the other in this process.
+@dataclass(frozen=True)
+class TimeBudget:
+    """The stages of scenes that have `seconds` together, counted from `started`, with the least expected errors.
 
-    Raises InputError if `scheduler` or `workers` are given.
+    They run one after the other in this process. Each has an equal share of the time that is left, so that a scene that
+    fails leaves its share to the others.
+
+    folders : of the scenes, in the order in which they are run;  say : takes a message if a run took longer
+    force : True to make again what is up to date
     """
-    if scheduler or workers is not None:
-        raise InputError("--within divides the time of this machine's one process; leave out --scheduler and --workers")
-    return shared_time(seconds, [member.folder for member in members], started, say)
 
+    seconds: float
+    folders: Sequence[Path]
+    started: float
+    say: Callable[[str], None]
+    clock: Clock = perf_counter
+    force: bool = False
 
-def check_within(setup: Setup, folder: Path) -> None:
-    """Raise InputError for what would stop a run within a time after some work. Nothing is written."""
-    stages.check_run(_with_samples(setup, FEW, FEW), folder)
-
-
-def shared_time(
-    seconds: float, folders: Sequence[Path], started: float, say: Callable[[str], None], clock: Clock = perf_counter
-) -> Stages:
-    """Create the stages of scenes that have `seconds` together, counted from `started`.
-
-    folders : of the scenes, in the order in which they are run
-    Each scene has an equal share of the time that is left, so that a scene that fails leaves its share to the others.
-    """
-    request = RequestedTime(seconds=seconds, scenes=len(folders))
-
-    def run(setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
-        begun = started if request.scenes == 1 else clock()
-        share = (seconds - (begun - started)) / (request.scenes - folders.index(folder))
-        return run_within(setup, folder, observer, share, say, clock, begun, request)
-
-    return run
-
-
-def run_within(
-    setup: Setup,
-    folder: Path,
-    observer: RunObserver,
-    seconds: float,
-    say: Callable[[str], None],
-    clock: Clock = perf_counter,
-    begun: float | None = None,
-    request: RequestedTime | None = None,
-) -> dict[str, Any]:
-    """Run a scene with the samples that give the least expected error within `seconds`, and return its description.
-
-    say : takes a message if the run took longer
-    begun : when the time began to count; None: now
-    request : the request that `seconds` are a share of; it identifies a repeated run, as shares vary
-    """
-    begun = clock() if begun is None else begun
-    requested = RequestedTime(seconds=seconds, scenes=1) if request is None else request
-    earlier = _earlier_run(folder, setup, requested)
-    if earlier is not None:
-        results = stages.results(_with_samples(setup, *_samples_of(earlier)), folder, observer)
-        same = earlier.model_dump(include={"within", "asked", "seconds", "chosen"})
-        return _finish(results, folder, observer, TimeReport.model_validate(same))
-
-    samples: tuple[Samples, Samples] = (FEW, FEW)
-    page = 0.0
-    while True:
-        start = clock()
-        results = stages.results(_with_samples(setup, *samples), folder, observer)
-        wall = clock() - start
-        if page == 0.0 and seconds - (clock() - begun) > 2 * wall:
-            page = _page_seconds(results, folder, observer, clock)
-        rest = (1 - RESERVE) * (seconds - (clock() - begun)) - page
-        more = _more_samples(results, samples, wall, rest - COMPILATION)
-        if more is None:
-            break
-        samples = more
-    total = clock() - begun + page  # the final page is still to be written
-    if total > seconds:
-        fewest = ", the fewest possible" if samples == (FEW, FEW) else ""
-        counts = f"{samples[0]} and {samples[1]} samples per pixel{fewest}"
-        say(f"{folder}: took {total:.1f} s of {seconds:g} s with {counts}")
-    chosen: dict[str, Samples] = dict(zip(KEYS, samples, strict=True))
-    spent = {"within": seconds, "asked": requested, "seconds": total, "chosen": chosen}
-    return _finish(results, folder, observer, TimeReport.model_validate(spent))
+    def __call__(self, setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
+        """Run a scene, and return its description; a repeated run is known by the request, as shares vary."""
+        clock, request = self.clock, RequestedTime(seconds=self.seconds, scenes=len(self.folders))
+        begun = self.started if request.scenes == 1 else clock()
+        seconds = (self.seconds - (begun - self.started)) / (request.scenes - self.folders.index(folder))
+        force = self.force
+        earlier = None if force else _earlier_run(folder, setup, request)
+        if earlier is not None:
+            return stages.run(_with_samples(setup, *_samples_of(earlier)), folder, observer)
+        samples: tuple[Samples, Samples] = (FEW, FEW)
+        page = 0.0
+        while True:
+            start = clock()
+            results = stages.results(_with_samples(setup, *samples), folder, observer, force)
+            force = False
+            wall = clock() - start
+            if page == 0.0 and seconds - (clock() - begun) > 2 * wall:  # as long as the final one will take
+                start = clock()
+                write_page(results, folder, observer)
+                page = clock() - start
+            rest = (1 - RESERVE) * (seconds - (clock() - begun)) - page
+            more = _more_samples(results, samples, wall, rest - COMPILATION)
+            if more is None:
+                break
+            samples = more
+        total = clock() - begun + page  # the final page is still to be written
+        if total > seconds:
+            fewest = ", the fewest possible" if samples == (FEW, FEW) else ""
+            counts = f"{samples[0]} and {samples[1]} samples per pixel{fewest}"
+            self.say(f"{folder}: took {total:.1f} s of {seconds:g} s with {counts}")
+        chosen: dict[str, Samples] = dict(zip(KEYS, samples, strict=True))
+        limit = {"within": seconds, "asked": request, "seconds": total, "chosen": chosen}
+        report = results.report.with_changes(spent=results.report.spent.model_copy(update=limit))
+        return finish(replace(results, report=report), folder, observer).plain()
 
 
 def _more_samples(
@@ -186,13 +152,6 @@ def _samples_of(spent: TimeReport) -> tuple[Samples, Samples]:
     return spent.chosen[KEYS[0]], spent.chosen[KEYS[1]]
 
 
-def _page_seconds(results: StageResults, folder: Path, observer: RunObserver, clock: Clock) -> float:
-    """Write the page of the present results, and return the seconds that it took, as the final one will."""
-    start = clock()
-    write_page(results, folder, observer)
-    return clock() - start
-
-
 def _earlier_run(folder: Path, setup: Setup, requested: RequestedTime) -> TimeReport | None:
     """Return the times of the run in `folder` if it was of the same scene with the same request."""
     try:
@@ -202,9 +161,3 @@ def _earlier_run(folder: Path, setup: Setup, requested: RequestedTime) -> TimeRe
     except (InputError, OSError, ValueError, KeyError):
         return None
     return earlier if same_scene and earlier.asked == requested else None
-
-
-def _finish(results: StageResults, folder: Path, observer: RunObserver, spent: TimeReport) -> dict[str, Any]:
-    """Write page and run.json with the request and the times, and return the description."""
-    report = results.report.with_changes(spent=spent)
-    return finish(replace(results, report=report), folder, observer).plain()

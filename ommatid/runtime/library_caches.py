@@ -45,22 +45,13 @@ def library_caches() -> Generator[None]:
 
 def _default_folders() -> dict[str, list[Path]]:
     """For each variable that names a cache, the folders without it, which must all be usable."""
-    named = os.environ.get("HOME", "")
-    home = _home()
+    home = Path(os.environ.get("HOME") or os.devnull)
     config = Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config")
     cache = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
     return {
-        "DRJIT_CACHE_DIR": [Path(named or os.devnull, ".drjit")],
+        "DRJIT_CACHE_DIR": [home / ".drjit"],
         "MPLCONFIGDIR": [config / "matplotlib", cache / "matplotlib"],
     }
-
-
-def _home() -> Path:
-    """Return the home folder; one that does not exist for a user without any."""
-    try:
-        return Path.home() if os.environ.get("HOME") != "" else Path(os.devnull)  # empty: would be the root folder
-    except RuntimeError:
-        return Path(os.devnull)
 
 
 def _writable(folder: Path) -> bool:

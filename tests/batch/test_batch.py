@@ -10,7 +10,6 @@ from threadpoolctl import threadpool_info, threadpool_limits  # pyright: ignore[
 from ommatid.batch import plan
 from ommatid.batch.batch import Member
 from ommatid.batch.plan import concurrent_by_memory, estimate_cost, fastest_process_count
-from ommatid.pipeline import stages
 from ommatid.reconstruct import method_choice
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY
 from ommatid.runtime import files
@@ -35,11 +34,11 @@ def test_a_run_removes_the_temporary_files_of_a_killed_one(kept: Path, ommatid: 
 def test_processes_are_limited_by_scenes_processors_and_memory(
     fit: int, cores: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stages, "processors", lambda: cores)
+    monkeypatch.setattr(plan, "processors", lambda: cores)
     monkeypatch.setattr(plan, "concurrent_by_memory", lambda _: fit)
     monkeypatch.setattr(plan, "fastest_process_count", lambda _, most, __: most)
     three = [Member(Path(f"{name}.toml"), Path(name)) for name in "abc"]
-    assert [stages.process_count(members) for members in (three, three[:1])] == [expected, 1]
+    assert [plan.process_count(members) for members in (three, three[:1])] == [expected, 1]
 
 
 def test_memory_is_that_of_the_largest_scenes(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,16 +10,7 @@ import pytest
 from skimage.io import imsave
 
 from ommatid.batch.batch import prepare
-from ommatid.batch.remote import (
-    SceneOutcome,
-    WorldPackage,
-    carry_out,
-    outcome_of,
-    packed,
-    packed_world,
-    unpack,
-    unpacked_world,
-)
+from ommatid.batch.remote import SceneOutcome, carry_out, outcome_of, packed, unpack, write_inside
 from ommatid.pipeline.stages import open_scene, run
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.formats import exr
@@ -86,7 +77,7 @@ def test_a_file_with_an_absolute_name_is_refused(deep: Path, here: Path) -> None
     picture = here / "pictures" / "wall.png"
     (here / "places" / "wall.xml").write_text(WALL.format(picture=picture), encoding="utf-8")
     with pytest.raises(InputError, match=r"deep\.toml: world\.file: names .*wall\.png, which other machines"):
-        packed_world(open_scene(deep, OUTSIDE_TOO).scene)
+        packed(open_scene(deep, OUTSIDE_TOO), here / "out")
 
 
 OUTSIDE = ("../x", "a/../../x", "/elsewhere/x", "..", "", "a/b/../../../x")
@@ -101,9 +92,8 @@ def test_no_file_of_another_machine_is_written_outside_its_folder(tmp_path: Path
             unpack(SceneOutcome({**good, name: b"3"}, {}, {}), folder)
         with pytest.raises(InputError, match="expected one inside this folder"):
             unpack(SceneOutcome(good, {}, {}, removed=(name,)), folder)
-        for package in (WorldPackage("/", "b", {**good, name: b"3"}), WorldPackage("/", name, good)):
-            with pytest.raises(InputError, match="expected one inside this folder"):
-                unpacked_world(package, folder)
+        with pytest.raises(InputError, match="expected one inside this folder"):
+            write_inside(folder, {**good, name: b"3"})
     assert [*tmp_path.iterdir()] == [folder]
     assert [*folder.iterdir()] == []
 
@@ -115,10 +105,10 @@ def test_a_package_that_leads_out_of_a_workers_folder_is_refused(
     (here / "scratch").mkdir()
     setup = open_scene(deep, OUTSIDE_TOO)
     package = packed(setup, here / "out")
-    assert package.world is not None
-    world = replace(package.world, contents={**package.world.contents, "../../escaped": b"x"})
-    outcome = carry_out(run, replace(package, world=world))
+    assert package.world
+    outcome = carry_out(run, replace(package, world={**package.world, "../../escaped": b"x"}))
     assert isinstance(outcome.error, InputError)
-    with pytest.raises(InputError, match="expected one inside this folder"):
-        carry_out(run, replace(package, files={"../escaped": b"x"}))
+    for changes in ({"files": {"../escaped": b"x"}}, *({"world_file": name} for name in OUTSIDE if name)):
+        with pytest.raises(InputError, match="expected one inside this folder"):
+            carry_out(run, replace(package, **changes))
     assert [*(here / "scratch").iterdir()] == []

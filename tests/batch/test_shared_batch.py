@@ -188,35 +188,6 @@ def test_a_batch_whose_process_dies_keeps_what_is_finished(here: Path, scenes: l
     assert {path.name for path in (here / "out" / "seed1").iterdir()} == FILES
 
 
-# A slow callback of the garbage collector, once there is a file "flag": Python drops a Ctrl-C inside it.
-SLOW_CALLBACK = """
-import gc, pathlib, sys, time
-def slow(phase, info):
-    if pathlib.Path("flag").exists() and phase == "start":
-        pathlib.Path("flag").unlink()
-        print("in the callback", file=sys.stderr, flush=True)
-        time.sleep(60)
-gc.callbacks.append(slow)
-gc.set_threshold(1)
-"""
-
-
-@pytest.mark.slow
-def test_ctrl_c_that_a_callback_drops_is_noticed(here: Path, scenes: list[str]) -> None:
-    (here / "long.toml").write_text(LONG, encoding="utf-8")
-    with started("run", scenes[0], "long.toml", "-o", "out", "--workers", "2", before=SLOW_CALLBACK) as command:
-        assert command.stderr is not None
-        wait_for(here / "out" / "long" / "stack.exr")
-        (here / "flag").touch()
-        while command.stderr.readline() != "in the callback\n":
-            pass
-        os.kill(command.pid, signal.SIGINT)
-        messages = command.stderr.read()
-    assert "Exception ignored in: <function slow" in messages, "the callback dropped nothing"
-    assert messages.endswith(STOPPED)
-    assert command.returncode == 1
-
-
 # --- scenes sent to another machine
 
 

@@ -1,12 +1,14 @@
-"""Numbers of every option of every command: bounded on both sides, or refused by one short sentence."""
+"""Options of every command: a help text, and numbers that are bounded on both sides, or refused by a short sentence."""
 
 from __future__ import annotations
 
+import ast
 import inspect
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, cast, get_args, get_type_hints
 
 import pytest
+import typer.main
 
 from ommatid.batch.sweep import job_numbers, members, sweep_axes
 from ommatid.cli import options
@@ -14,6 +16,7 @@ from ommatid.cli.app import app
 from ommatid.runtime.errors import InputError
 
 from ..conftest import Command
+from ..modules import modules
 
 UNBOUNDED = {"flat_value", "point_value"}  # checked by `options.positive`
 
@@ -67,3 +70,23 @@ def test_combinations_of_a_sweep_are_counted_before_they_are_made() -> None:
         sweep_axes([f"noise.variance={values},7"])
     assert len(str(refusal.value)) <= 300
     assert len(members([Path("s.toml")], axes[:1], Path("out"))) == 2000
+
+
+# --- the command line is a shell: its functions are short, and every option of a command has a help text
+
+
+LONGEST = 50  # lines of a function, its signature and docstring included
+COMMANDS: dict[str, Any] = cast(Any, typer.main.get_command(app)).commands
+
+
+def test_no_function_is_long() -> None:
+    for module in [name for name in modules() if name.startswith("ommatid.cli.")]:
+        for node in ast.walk(ast.parse(modules()[module].read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                assert (node.end_lineno or node.lineno) - node.lineno < LONGEST, node.name
+
+
+def test_every_command_and_option_has_a_help_text() -> None:
+    for name, command in COMMANDS.items():
+        assert command.help, name
+        assert [parameter.name for parameter in command.params if not parameter.help] == []

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ommatid.batch.remote import RunObserver
-from ommatid.pipeline.time_budget import FEW, KEYS, allocate, run_within, shared_time
+from ommatid.pipeline.time_budget import FEW, KEYS, TimeBudget, allocate
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes.scene import read
@@ -70,7 +70,7 @@ def within(folder: Path, setup: Setup, seconds: float, clock: Callable[[], float
     """Description of a run within a time, and its messages."""
     messages: list[str] = []
     folder.mkdir(exist_ok=True)
-    return run_within(setup, folder, OBSERVER, seconds, messages.append, clock), messages
+    return TimeBudget(seconds, [folder], clock(), messages.append, clock)(setup, folder, OBSERVER), messages
 
 
 def ticking(step: float) -> Callable[[], float]:
@@ -120,7 +120,7 @@ def test_scenes_with_a_common_time_are_repeated_too(tmp_path: Path, monkeypatch:
     folders = [tmp_path / name for name in ("fails", "a", "b")]
 
     def run(folders: list[Path], step: float) -> list[dict[str, Any]]:
-        stages = shared_time(0.9, folders, 0.0, lambda _: None, ticking(step))
+        stages = TimeBudget(0.9, folders, 0.0, lambda _: None, ticking(step))
         return [stages(setup_of(), folder, OBSERVER)["spent"] for folder in folders if folder.name != "fails"]
 
     for folder in folders[1:]:

@@ -18,7 +18,7 @@ from ommatid.reconstruct.methods.tile_solver import overlapping_tiles
 from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.execution.pool import worker_pool
+from ommatid.runtime.execution.cluster import worker_pool
 from ommatid.scenes.scene import Scene
 from ommatid.simulate.ideal import ideal_model
 

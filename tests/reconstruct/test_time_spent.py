@@ -23,7 +23,7 @@ def timed(**spent: object) -> RunReport:
 
 def test_every_stage_counts_in_the_total_and_those_that_sample_in_the_time_with_more_samples() -> None:
     """Twice the samples take twice the 3 s of the stages that take samples, and 0.5 s as before."""
-    report = timed().with_times(files=0.25, page=0.75, start_up=0.3)
+    report = timed().with_times(files=0.25, start_up=0.3).with_stage(PAGE, 0.75)
     assert report.seconds == pytest.approx(4.5)
     assert list(report.stages) == ["render", "calibrate", "reconstruct", "files", "page"]
     assert report.more_samples[0].seconds == pytest.approx(2 * 3 + 0.5)
@@ -40,5 +40,5 @@ def test_a_time_limit_keeps_the_time_of_all_its_trials() -> None:
 def test_the_report_of_the_stages_is_the_same_whatever_time_files_and_page_took(spent: dict[str, float]) -> None:
     report = timed(**spent)
     for files, page in ((0.25, 0.75), (0.5, 1.0)):
-        assert report.with_times(files, page, start_up=0.3).of_stages().plain() == report.plain()
+        assert report.with_times(files, 0.3).with_stage(PAGE, page).of_stages().plain() == report.plain()
     assert report.with_stage("study", 0.5).of_stages().plain() != report.plain()

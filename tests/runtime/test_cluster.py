@@ -21,8 +21,7 @@ from distributed import LocalCluster, Security
 from ommatid.pipeline.batches import Batch
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution import workers
-from ommatid.runtime.execution.cluster import SILENT, Cluster, cluster_workers
-from ommatid.runtime.execution.pool import worker_pool
+from ommatid.runtime.execution.cluster import SILENT, Cluster, cluster_workers, worker_pool
 from ommatid.runtime.progress import no_progress
 
 from ..conftest import TINY, Command
@@ -233,9 +232,9 @@ def test_a_worker_that_joins_later_with_another_version_is_named(monkeypatch: py
 def test_a_task_of_endless_recursion_ends() -> None:
     """Dask waits for ever for an error whose traceback it cannot send."""
     with started() as cluster, worker_pool(Cluster(cluster.scheduler_address)) as pool:
-        (task,) = pool.each(endless, [0])
+        ((_, result),) = pool.each(endless, [0])
         with pytest.raises(RuntimeError, match="RecursionError: maximum recursion"):
-            task.result()
+            result()
 
 
 @pytest.mark.slow
@@ -245,7 +244,7 @@ def test_a_lost_scheduler_ends_a_batch_and_keeps_what_is_finished(
 ) -> None:
     for name in "abc":
         Path(f"{name}.toml").write_text(TINY, encoding="utf-8")
-    collect: Any = Batch._collect  # pyright: ignore[reportPrivateUsage]
+    collect: Any = Batch.collect
     command = "render", "a.toml", "b.toml", "c.toml", "-o", "out"
     with config.set({"distributed.comm.timeouts.connect": "0.5s"}), started() as cluster:
 
@@ -254,7 +253,7 @@ def test_a_lost_scheduler_ends_a_batch_and_keeps_what_is_finished(
             cluster.close()
             return description
 
-        monkeypatch.setattr(Batch, "_collect", collect_and_lose)
+        monkeypatch.setattr(Batch, "collect", collect_and_lose)
         ended = ommatid(*command, "--scheduler", cluster.scheduler_address)
     *done, last = ended.err.splitlines()
     assert ended.code == 1

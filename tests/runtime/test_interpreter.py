@@ -130,7 +130,7 @@ def test_figures_do_not_depend_on_settings(tmp_path: Path) -> None:
 def test_other_modules_start_no_python() -> None:
     """multiprocessing's processes, and Python started by `-c`, would have the current folder on their path."""
     for name, path in modules().items():
-        assert "multiprocessing" not in imports(name) or name.endswith(".execution.pool"), name
+        assert "multiprocessing" not in imports(name) or name.endswith(".execution.workers"), name
         text = path.read_text(encoding="utf-8")
         safe = name.endswith(".execution.interpreter") or text.count("sys.executable") == text.count('executable, "-P"')
         assert safe, name

@@ -21,8 +21,7 @@ import pytest
 
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution import workers
-from ommatid.runtime.execution.cluster import Cluster
-from ommatid.runtime.execution.pool import worker_pool
+from ommatid.runtime.execution.cluster import Cluster, worker_pool
 from ommatid.runtime.progress import no_progress
 
 from ..conftest import Command
@@ -126,8 +125,8 @@ def test_without_workers_tasks_are_done_one_by_one_and_items_made_when_needed() 
         return item
 
     with worker_pool() as pool:
-        for ended in pool.each(task, items()):
-            events.append(f"ended {ended.result()}")
+        for _, result in pool.each(task, items()):
+            events.append(f"ended {result()}")
     assert events == [f"{event} {item}" for item in range(3) for event in ("item", "task", "ended")]
 
 
@@ -157,10 +156,10 @@ def test_a_failure_is_the_same_here_and_on_a_cluster(
     with worker_pool(Cluster(request.getfixturevalue("address")) if remote else None) as pool:
         with pytest.raises(error, match=r"^the picture is upside down; turn it$"):
             pool.map(fine_or_raises, [None, error, None], no_progress, 3)
-        ended = {task.index: task for task in pool.each(fine_or_raises, [None, error, None])}
-        assert (ended[0].result(), ended[2].result()) == ("fine", "fine")
+        results = dict(pool.each(fine_or_raises, [None, error, None]))
+        assert (results[0](), results[2]()) == ("fine", "fine")
         with pytest.raises(error, match="upside down"):
-            ended[1].result()
+            results[1]()
 
 
 def test_a_process_that_dies_ends_the_tasks_with_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
@@ -174,9 +173,9 @@ def test_a_process_that_dies_ends_the_tasks_with_one_sentence(capfd: pytest.Capt
 
 def test_an_exception_that_cannot_be_sent_is_described() -> None:
     with worker_pool(count=2) as pool:
-        ended = list(pool.each(raises_unsendable, range(2)))
+        results = dict(pool.each(raises_unsendable, range(2)))
         with pytest.raises(RuntimeError, match="UnsendableError: egg"):
-            ended[0].result()
+            results[0]()
 
 
 def test_processes_use_no_network_share_the_processors_and_leave_nothing(
@@ -241,7 +240,10 @@ def test_workers_with_other_versions_are_refused(address: str) -> None:
 @pytest.mark.usefixtures("impatient")
 def test_wrong_options_are_refused_in_one_line(here: Path, ommatid: Command) -> None:
     for options, message in (
-        (("--scheduler", "tcp://127.0.0.1:8786", "--workers", "2"), "--scheduler and --workers: expected one of them"),
+        (
+            ("--scheduler", "tcp://127.0.0.1:8786", "--workers", "2"),
+            "--scheduler and --workers: expected one",
+        ),
         (("--scheduler", "127.0.0.1:8786"), "expected an address such as tcp://"),
         (("--scheduler", "http://127.0.0.1:80"), "expected an address such as tcp://"),
         (("--scheduler", "tcp://127.0.0.1:1"), "--scheduler tcp://127.0.0.1:1: no scheduler answers there"),

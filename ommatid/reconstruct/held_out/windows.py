@@ -15,7 +15,7 @@ import numpy as np
 from scipy import linalg, sparse
 
 from ommatid.runtime.arrays import FloatArray, IntArray
-from ommatid.runtime.execution.pool import worker_pool
+from ommatid.runtime.execution.cluster import worker_pool
 from ommatid.runtime.machine import one_thread, processors
 from ommatid.scenes.camera import Camera
 

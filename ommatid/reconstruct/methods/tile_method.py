@@ -14,7 +14,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.execution.pool import worker_pool
+from ommatid.runtime.execution.cluster import worker_pool
 from ommatid.runtime.files import digest
 from ommatid.runtime.machine import one_thread, processors
 

@@ -17,10 +17,9 @@ from .run_json import (
     SolverReport,
     StageReport,
 )
-from .verdict_words import cause, error_words, grounds, heading, is_trusted, limit
+from .verdict_words import causes, error_words, grounds, heading, limit
 
 UNDETERMINED = 5.0  # deviation of the logarithm of a fitted number that may be anything
-ALIKE = 0.01  # relative difference of two errors, below which neither is called smaller
 METHODS = {
     "single": "best single sub-image",
     "rearranged": "pixel rearrangement",
@@ -139,24 +138,6 @@ def baseline_rows(report: RunReport) -> list[tuple[str, str, str, str, str]]:
     return [row for _, row in sorted(pairs, key=lambda pair: pair[0])]
 
 
-def baseline_words(report: RunReport) -> str:
-    """Return which of the baselines have smaller errors than the estimate, as sentences; empty without baselines."""
-    mse = report.error.mse
-    if mse is None or not _compared(report):
-        return ""
-    better = [each for each in report.baselines if each.mse < (1 - ALIKE) * mse]
-    alike = [each for each in report.baselines if abs(each.mse - mse) <= ALIKE * mse]
-    words = "No other method has a smaller error."
-    if better:
-        ratios = ", ".join(f"{METHODS[each.method]} ({each.mse / mse:.2g} of the estimate's)" for each in better)
-        words = f"Smaller errors than the estimate's: {ratios}."
-    if alike:
-        words += f" As large within {100 * ALIKE:.0f} %: {', '.join(METHODS[each.method] for each in alike)}."
-    if any(each.method == "total_variation" for each in report.baselines):
-        words += " The weight of total variation is the best one for this picture, chosen with the truth at hand."
-    return words
-
-
 def _compared(report: RunReport) -> list[tuple[str, str, str, str, str]]:
     """Return the rows of the baselines, none without `--baselines`, where there is at most the single sub-image."""
     single = report.single
@@ -231,9 +212,7 @@ def _method(solver: SolverReport) -> str:
 def _error(error: ErrorReport) -> list[Fact]:
     given, total = error.expected_given_truth, error.predicted_mse
     parts = [
-        Fact(f"  from {cause(name)}", f"{part:.3g}", f"{100 * part / total:.1f} %")
-        for name, part in error.budget.items()
-        if part > 0 and total > 0
+        Fact(f"  from {name}", f"{part:.3g}", f"{share:.1f} %") for name, part, share in causes(error.budget, total)
     ]
     predicted = [Fact("predicted MSE (Eq. 5)", f"{total:.4g}", "for images of the prior"), *parts]
     if error.mse is None:
@@ -336,7 +315,7 @@ def _time(report: RunReport) -> list[Fact]:
         chosen = ", ".join(f"{key} {value}" for key, value in spent.chosen.items())
         limit = f"{spent.seconds or 0.0:.1f} s of {spent.within:g} s, all trials together"
         found.append(Fact("  of the time limit", limit, chosen, "stage"))
-    if more and is_trusted(report):
+    if more and report.verdict.trusted:
         found += [
             Fact(f"MSE with {each.times} times the samples", f"at most {each.predicted_mse:.4g}", time, "stage")
             for each in more

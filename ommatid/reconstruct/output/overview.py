@@ -27,7 +27,7 @@ OVERVIEW = "overview.png"
 COLUMN_INCHES, ROW_INCHES = 3.4, 3.15
 LEFT, RIGHT, TOP, BOTTOM = 0.75, 0.55, 1.25, 0.55  # inches around all panels; a layout by matplotlib takes a second
 MOST_IN_A_ROW = 6
-LEAST_PART = 1e-4  # of the expected error; smaller parts are not drawn
+LEAST_SHARE = 0.01  # per cent of the expected error; smaller parts are not drawn
 GOOD, DOUBT, BAD = "#17734a", "#8a5a00", "#b3261e"  # of the verdict
 
 
@@ -77,15 +77,15 @@ def result_panels(channels: Mapping[str, Float32Array]) -> dict[str, FigurePanel
     if truth is not None:
         error = estimate - truth
         panels["error"] = FigurePanel("Error: estimate minus truth", error, FigureScale.signed(error))
-    scale = FigureScale.positive(float(deviation.max()), "standard deviation (grey levels)")
+    scale = FigureScale.deviation(deviation)
     return {**panels, "deviation": FigurePanel("Expected standard deviation", deviation, scale)}
 
 
 def _draw_budget(axes: Any, report: RunReport) -> None:
     """Draw the parts of the expected error as bars, each below its cause, which leaves room for long names."""
     mse = report.error.predicted_mse
-    parts = {name: part for name, part in report.error.budget.items() if part > LEAST_PART * mse}
-    shares = {verdict_words.cause(name): 100 * part / mse for name, part in parts.items()}
+    parts = verdict_words.causes(report.error.budget, mse)
+    shares = {name: share for name, _, share in parts if share > LEAST_SHARE}
     bars = axes.barh(range(len(shares)), list(shares.values()), height=0.45, color="tab:blue")
     axes.bar_label(
         bars, [f"{share:.2g} %" if share < 10 else f"{share:.0f} %" for share in shares.values()], padding=3, fontsize=8

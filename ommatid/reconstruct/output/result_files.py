@@ -88,15 +88,24 @@ def reconstruct(
     workers: Workers | None = None,
     progress: Progress = no_progress,
     prepared: Prepared | None = None,
+    current: str = "",
+    regions: Sequence[Region] = (),
 ) -> tuple[Reconstruction, RunReport]:
-    """Return the reconstruction and the content of run.json.
+    """Return the reconstruction and the content of run.json, with its origin and the means over `regions`.
 
     names : of the files of stack and model, for error messages;  prepared : what frames of this model share
+    current : fingerprint of everything that the result depends on
     Raises InputError if stack and model do not belong together.
     """
     check_camera(stack.camera, model, names)
     restoration = restore(stack, model, truth, workers, progress, prepared)
-    return restoration, report_of(stack, model, restoration)
+    means = tuple(
+        RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
+        for corner, size in regions
+        for mean, deviation in [restoration.region(corner, size)]
+    )
+    added = {"fingerprint": current, **origin(), **({"regions": means} if means else {})}
+    return restoration, report_of(stack, model, restoration).with_changes(**added)
 
 
 def write_estimate(path: Path, restoration: Reconstruction, record: dict[str, Any]) -> None:
@@ -188,16 +197,6 @@ def _is_whole(picture: Path) -> bool:
         return stream.read() == PNG_END
 
 
-def region_reports(outcome: Reconstruction, regions: Sequence[Region]) -> dict[str, Any]:
-    """Return `regions` of run.json: the means over parts of the estimate; nothing without regions."""
-    reports = tuple(
-        RegionReport(corner=corner, size=size, mean=mean, deviation=deviation)
-        for corner, size in regions
-        for mean, deviation in [outcome.region(corner, size)]
-    )
-    return {"regions": reports} if reports else {}
-
-
 def cached_results(
     folder: Path,
     stack: Stack,
@@ -213,8 +212,6 @@ def cached_results(
     current = fingerprint_of(stack, model, truth, regions)
 
     def make() -> tuple[Reconstruction, RunReport]:
-        restoration, report = reconstruct(stack, model, truth, names, workers, progress)
-        added = {"fingerprint": current, **origin(), **region_reports(restoration, regions)}
-        return restoration, report.with_changes(**added)
+        return reconstruct(stack, model, truth, names, workers, progress, None, current, regions)
 
     return cached(folder, current, read_results, make, lambda _, made: write_results(folder, stack, *made), force)

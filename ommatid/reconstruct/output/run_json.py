@@ -456,11 +456,13 @@ class RunReport(Record):
         """Return a copy with the time of one more stage."""
         return self.with_changes(stages={**self.stages, name: StageReport(seconds=seconds)})
 
-    def with_times(self, files: float, page: float, start_up: float | None) -> RunReport:
-        """Return a copy with the times of what surrounds the stages, in seconds."""
-        timed = self.with_stage(FILES, files).with_stage(PAGE, page)
+    def with_times(self, files: float, start_up: float | None) -> RunReport:
+        """Return a copy with the seconds for reading, checking and writing files, and those before the first stage.
+
+        start_up : None where the process ran other scenes, too
+        """
         known = {} if start_up is None else {"start_up": start_up}
-        return timed.with_changes(spent=self.spent.model_copy(update=known))
+        return self.with_stage(FILES, files).with_changes(spent=self.spent.model_copy(update=known))
 
     def of_stages(self) -> RunReport:
         """Return a copy without the times of what surrounds the stages."""

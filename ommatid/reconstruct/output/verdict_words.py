@@ -1,4 +1,4 @@
-"""The verdict on a run in words, and what would reduce its error, as far as its numbers tell."""
+"""The verdict on a run in words, what would reduce its error, as far as its numbers tell, and the held-out check."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from math import sqrt
 from typing import NamedTuple
 
 from ..verdict.verdict import SPURIOUS_SHARE
-from .run_json import RunReport
+from .run_json import HeldOutEntry, HeldOutPrior, HeldOutReport, RunReport
 
 TIMES = 4  # as many samples, in the sentence on more samples
 LEAST_GAIN = 0.05  # relative fall of the error from which a change is worth a sentence
+LEAST = 1e-300  # probability that is printed
+MOST_ROWS = 5  # sub-imagers in the table, unless more are named
 
 
 class Change(NamedTuple):
@@ -31,11 +33,6 @@ CHANGES = {  # by the cause's name in the budget
     ),
 }
 SAMPLES = {"rendering": "`render.samples`", "calibration": "`calibration.samples`"}
-
-
-def is_trusted(report: RunReport) -> bool:
-    """Return True unless the verdict says that the error bars are not to be trusted."""
-    return report.verdict.trusted
 
 
 def follows_samples(report: RunReport) -> bool:
@@ -96,7 +93,7 @@ def steps_of(report: RunReport) -> list[NextStep]:
 
 def limit(report: RunReport) -> str:
     """Return what limits the error in half a sentence: the cause, its share, and a change that would reduce it."""
-    if not is_trusted(report):
+    if not report.verdict.trusted:
         return "unknown as long as the result is not to be trusted"
     now = report.error.predicted_mse
     if now <= 0:
@@ -118,6 +115,11 @@ def error_words(mse: float, digits: int = 4) -> str:
     return f"{mse:.{digits}g} ({sqrt(mse):.3g} grey levels RMS)"
 
 
+def causes(budget: dict[str, float], mse: float) -> list[tuple[str, float, float]]:
+    """Return the parts of a predicted squared error: cause, part, and share in per cent."""
+    return [(cause(name), part, 100 * part / mse) for name, part in budget.items() if part > 0 and mse > 0]
+
+
 def cause(name: str) -> str:
     """Return the name of a part of the error in words."""
     words = {
@@ -130,3 +132,56 @@ def cause(name: str) -> str:
         "misalignment": "misalignment of the lenses",
     }
     return words.get(name, name.replace("_", " "))
+
+
+def held_out_rows(report: HeldOutReport) -> list[tuple[str, str]]:
+    """Return names and values, the verdict first."""
+    pixels = sum(entry.pixels for entry in report.sub_imagers)
+    lines = [("verdict", _held_out_verdict(report)), ("prior", _prior_words(report.prior))]
+    if not report.judged:
+        return lines
+    where = ""
+    if report.windows.total > 1:
+        where = f", in {report.windows.checked} of {report.windows.total} windows of the target"
+    lines += [
+        ("sub-imagers predicted", f"{report.judged} of {len(report.sub_imagers)}, {pixels} pixels{where}"),
+        ("largest deviation", f"{_probability(report.p_value)}, among all sub-imagers"),
+    ]
+    worst = report.worst()
+    shown = worst[: max(MOST_ROWS, sum(entry.named for entry in worst))]
+    return lines + [(f"  {entry.name}", _entry_words(entry)) for entry in shown]
+
+
+def _held_out_verdict(report: HeldOutReport) -> str:
+    """Return the verdict as a sentence."""
+    trusted, reasons = report.verdict.trusted, "; ".join(report.verdict.reasons)
+    if trusted is None:
+        return reasons
+    if not trusted:
+        return f"not to be trusted: {reasons}"
+    return f"all {report.judged} sub-imagers agree with their predictions from the others"
+
+
+def _entry_words(entry: HeldOutEntry) -> str:
+    """Return z, probability and size of a sub-imager's error."""
+    words = (
+        f"z = {entry.z:.1f}, {_probability(entry.p_value)}, errs by {entry.rms_error:.3g} grey levels,"
+        f" expected {entry.expected_rms:.3g}"
+    )
+    return f"{words}; contradicts the others" if entry.named else words
+
+
+def _prior_words(prior: HeldOutPrior) -> str:
+    """Return the prior that the predictions assumed, and where it came from."""
+    length = "" if prior.correlation_length is None else f", correlation length {prior.correlation_length:.3g} mm"
+    words = f"{prior.kind}, variance {prior.variance:.4g}{length}"
+    if prior.fitted:
+        return f"{words}, fitted to the stack"
+    return f"{words}, as the scene says; a photograph is no draw of it"
+
+
+def _probability(p_value: float | None) -> str:
+    """Return a probability, also one that float64 takes for 0."""
+    if p_value is None:
+        return "p unknown"
+    return f"p = {p_value:.2g}" if p_value >= LEAST else f"p < {LEAST:g}"

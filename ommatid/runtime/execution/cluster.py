@@ -1,17 +1,16 @@
-"""Workers of a running Dask cluster, on this machine or others, as `--scheduler` names it.
+"""Workers of this process, of processes here, or of a running Dask cluster, as `--workers` and `--scheduler` say.
 
 Certificates of tls:// are those of Dask's own configuration.
 """
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import sys
 import warnings
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +22,7 @@ from urllib.parse import urlsplit
 from ..errors import InputError, MachineError
 from ..printable import printable
 from . import workers
-from .workers import LOST, Completed, Workers, with_error_to_send
+from .workers import LOST, ProcessPool, SerialExecutor, Workers, with_error_to_send
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -52,6 +51,23 @@ class Cluster:
             )
         if find_spec("distributed") is None:
             raise InputError("--scheduler: needs Dask, which is not installed; run: pip install 'ommatid[cluster]'")
+
+
+@contextmanager
+def worker_pool(cluster: Cluster | None = None, count: int | None = None, threads: int = 1) -> Generator[Workers]:
+    """Start or connect to workers: those of `cluster`, or `count` processes, or `threads` of this process.
+
+    A count of 1 is this process. Raises InputError, which names the option, if there is no such cluster.
+    """
+    if cluster is not None:
+        with cluster_workers(cluster) as workers:
+            yield workers
+    elif count is not None and count > 1:
+        with ProcessPool(count) as pool:
+            yield Workers(pool, lambda: count)
+    else:
+        with SerialExecutor() if threads == 1 else ThreadPoolExecutor(threads) as executor:
+            yield Workers(executor, lambda: threads)
 
 
 def _is_address(text: str) -> bool:
@@ -98,7 +114,9 @@ class _ClusterWorkers(Workers):
             _check_same(str(self._cluster), worker, expected, answer)
         self._requirement = _Requirement(str(self._cluster), facts, expected)
 
-    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Generator[Completed[Result]]:
+    def each(
+        self, function: Callable[[Item], Result], items: Iterable[Item]
+    ) -> Generator[tuple[int, Callable[[], Result]]]:
         """Apply `function` as `Workers.each`; each task is preceded by the check of its worker."""
         return super().each(partial(_execute, self._requirement, function), items)
 
@@ -173,6 +191,8 @@ def scratch_folder() -> str | None:
 @contextmanager
 def _connected(cluster: Cluster) -> Generator[Any]:
     """Connect a client to a cluster with at least one worker. Raises InputError."""
+    import asyncio
+
     from distributed import Client
 
     security = _security(cluster)
@@ -216,6 +236,8 @@ def _no_answer(cluster: Cluster) -> str:
 
 async def _check_scheduler(cluster: Cluster, security: Any) -> None:
     """Return if a Dask scheduler answers; at another server's address the client itself would wait forever."""
+    import asyncio
+
     from distributed.comm.core import connect  # pyright: ignore[reportUnknownVariableType]
 
     options = security.get_connection_args("client")

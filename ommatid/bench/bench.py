@@ -3,132 +3,162 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
+from typing import Any
+
+import numpy as np
 
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.files import digest, fingerprint
 from ommatid.runtime.outputs.kinds import check_folder
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress
+from ommatid.runtime.study import FAILED, Row, study
 from ommatid.runtime.versions import versions
 from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.validation import check_scene
 
 from . import table as bench_file
-from .cells import Job, Subject, jobs, name_of
 from .figure import write_figures
-from .reference import reference
 from .slopes import curves, recommend
-from .table import AUTO, JSON, STAGES, BenchTable, Cell, SkippedJob
+from .subject import Repeat, Subject, settings
+from .table import AUTO, DENSE, JSON, BenchTable, Cell, Setting, Skipped, Stage
 
+JOURNAL = "bench.jsonl"
 LOCK = ".ommatid-bench.lock"  # runs into folders of this folder do not wait for it
+REPEATS, FEWER_REPEATS = 5, 3  # with independent seeds; odd, so that the median is one of the values
+LONG = 1.0  # seconds of a repeat, from which on FEWER_REPEATS are made
+QUANTILES = {"": 0.5, "_low": 0.1, "_high": 0.9}
+LATE = "it did not fit into the time limit"
+UNITS: dict[Stage, str] = {
+    "render": "values of f",
+    "calibrate": "entries of H",
+    "reconstruct": "posterior standard deviations",
+}
 
 
 def bench(setup: Setup, folder: Path, seconds: float, progress: Progress) -> tuple[BenchTable, bool]:
     """Return the bench table of a scene, and True if anything had to be measured for it.
 
-    The table is written after every cell, so that an interrupted bench goes on with the cells that it lacks. Those that
-    do not fit into `seconds` are left out.
-    Raises InputError for a scene that cannot be measured, and if `folder` holds the table of another scene.
+    Cells are kept in a journal, from which an interrupted bench goes on. Those that do not fit into `seconds` are left
+    out. Raises InputError for a scene that cannot be measured, and if `folder` holds the table of another scene.
     """
     _check_flat(setup.scene)
     check_folder(folder)
     setup = replace(setup, scene=_with_exact_assumptions(setup.scene), given_image=setup.image)
-    with occupied(folder, JSON, lock=LOCK):
+    with occupied(folder, JOURNAL, lock=LOCK):
         check_scene(setup, calibrates=False)
-        previous = _previous(folder, _fingerprint(setup))
-        if previous is not None and _is_complete(previous, seconds):
+        made_of = _fingerprint(setup)
+        previous = _previous(folder, made_of)
+        if previous is not None and (previous.budget >= seconds or not any(job.late for job in previous.left_out)):
             return previous, False
-        return _measured(setup, folder, seconds, previous, progress), True
+        table = _measured(setup, folder, seconds, made_of, progress)
+        write_figures(folder, table)
+        bench_file.write(folder, table)
+        progress(1.0)
+        return table, True
 
 
-def _measured(
-    setup: Setup, folder: Path, seconds: float, previous: BenchTable | None, progress: Progress
-) -> BenchTable:
-    """Measure the cells that `previous` lacks, and write table and figures."""
-    start = perf_counter() - (0.0 if previous is None else previous.seconds)
+def _measured(setup: Setup, folder: Path, budget: float, made_of: str, progress: Progress) -> BenchTable:
+    """Measure the cells that the journal of a folder lacks, and return the table."""
     with naming_source(setup.scene.source):
-        subject = Subject(setup, reference(setup))
-        listed, never = jobs(subject)
-
-    def table(cells: Sequence[Cell], left_out: Sequence[SkippedJob], budget: float) -> BenchTable:
-        return _table(subject, cells, (*never, *left_out), budget, perf_counter() - start)
-
-    def save(cells: Sequence[Cell]) -> None:
-        bench_file.write(folder, table(cells, (), 0.0))
-        progress(min(1.0, (perf_counter() - start) / seconds))
-
-    known = {} if previous is None else {name_of(cell): cell for cell in previous.cells}
-    complete = table(*measure(listed, known, start + seconds, save), seconds)
-    write_figures(folder, complete)
-    bench_file.write(folder, complete)
-    progress(1.0)
-    return complete
-
-
-def _table(
-    subject: Subject, cells: Sequence[Cell], left_out: tuple[SkippedJob, ...], budget: float, seconds: float
-) -> BenchTable:
-    """Return the table of cells; budget : 0 while they are measured."""
-    scene, made_of = subject.scene, _fingerprint(subject.setup)
+        subject = Subject.of(setup)
+        listed, left_out = settings(subject)
+    work = Measurement(subject.measure, budget, progress, folder / JOURNAL)
+    of = {"scene": made_of, **_libraries()}
+    rows = study(folder / JOURNAL, [of | each.model_dump() for each in listed], work.measure, work.report)
+    cells = [work.read(row) for row in rows if FAILED not in row]
+    failed = [(Setting(**row).name, row[FAILED]) for row in rows if FAILED in row]
+    left_out += [Skipped(what=name, why=why, late=why == LATE) for name, why in failed]
     system = os.uname().sysname, os.uname().release, os.uname().machine  # `platform` runs the command uname
     return BenchTable(
-        title=scene.title or scene.source.stem,
-        scene=made_of,
-        fingerprint=_made_from(made_of),
+        title=setup.scene.title or setup.scene.source.stem,
+        fingerprint=made_of,
         camera=subject.camera.describe(),
         machine={"cores": os.cpu_count(), "system": " ".join(system), "load": os.getloadavg()[0]},
-        versions=versions("mitsuba", "drjit", "scipy"),
-        against=subject.reference.description,
+        versions=_libraries(),
+        against=subject.against,
         noise_deviation=subject.noise_deviation,
         budget=budget,
-        seconds=seconds,
+        seconds=work.seconds,
         cells=tuple(cells),
         curves=tuple(curves(cells, subject.camera)),
         recommended=recommend(cells, subject.noise_floor),
-        left_out=left_out,
+        left_out=tuple(left_out),
     )
 
 
-def _is_complete(previous: BenchTable, seconds: float) -> bool:
-    """Return True unless a bench was interrupted, or left out cells that fit into more time."""
-    late = any(job.late for job in previous.left_out)
-    return previous.budget > 0 and (previous.budget >= seconds or not late)
+class Measurement:
+    """Measures cells within a time, of which those of the journal have taken a part."""
+
+    def __init__(
+        self, work: Callable[[Setting, int], Repeat], budget: float, progress: Progress, journal: Path
+    ) -> None:
+        """Start the clock; work : runs a repeat of a setting."""
+        self._work, self._budget, self._progress, self._journal = work, budget, progress, journal
+        self._start = perf_counter()
+        self._last: dict[tuple[str, ...], tuple[int, float]] = {}  # samples and seconds of the last cell of a way
+
+    @property
+    def seconds(self) -> float:
+        """Duration of all measurements."""
+        return perf_counter() - self._start
+
+    def read(self, row: Row) -> Cell:
+        """Return a row as a cell. Raises InputError if it is not one of a bench."""
+        try:
+            return Cell(**row)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{self._journal}: expected rows of a bench, got others; delete it") from error
+
+    def report(self, row: Row, new: bool) -> None:
+        """Take notice of a row of the study, and of the time that one of the journal took."""
+        if FAILED not in row:
+            cell = self.read(row)
+            self._start -= 0.0 if new else cell.seconds * cell.repeats
+            self._last[cell.stage, cell.way, cell.variant or ""] = cell.samples or 1, cell.seconds * cell.repeats
+        self._progress(min(1.0, self.seconds / self._budget))
+
+    def measure(self, cell: Row) -> Row:
+        """Measure all repeats of a cell. Raises InputError where it cannot be measured, or its time does not suffice.
+
+        The time is taken as proportional to the samples, from the cell before it.
+        """
+        setting, start, repeats = Setting(**cell), perf_counter(), list[Repeat]()
+        samples, seconds = self._last.get((setting.stage, setting.way, setting.variant or ""), (1, 0.0))
+        if self.seconds + seconds * (setting.samples or samples) / samples > self._budget:
+            raise InputError(LATE)
+        while len(repeats) < FEWER_REPEATS or (len(repeats) < REPEATS and perf_counter() - start < LONG * len(repeats)):
+            if repeats and self.seconds > self._budget:
+                raise InputError(LATE)
+            repeats.append(self._work(setting, len(repeats)))
+        return cell_of(setting, repeats).model_dump()
 
 
-def measure(
-    listed: Sequence[Job], known: dict[str, Cell], deadline: float, save: Callable[[Sequence[Cell]], None]
-) -> tuple[list[Cell], list[SkippedJob]]:
-    """Measure the cells that are not known, in their order, and return all, and those that were left out.
-
-    deadline : on the clock of `perf_counter`;  save : called with all cells after each that is measured
-    A cell is left out whose time does not suffice, if its time is proportional to its samples in the cells before it.
-    """
-    left_out: list[SkippedJob] = []
-    seconds: dict[tuple[str, str, str | None], tuple[int, float]] = {}  # samples and seconds of the last cell of a way
-    for job in listed:
-        way, samples, start = (job.stage, job.way, job.variant), job.samples or 1, perf_counter()
-        last_samples, last_seconds = seconds.get(way, (samples, 0.0))
-        cell = known.get(job.name)
-        if cell is None:
-            late = start + last_seconds * samples / last_samples > deadline
-            try:
-                cell = None if late else job.measure(deadline)
-            except InputError as error:
-                left_out.append(SkippedJob(what=job.name, why=str(error)))
-                continue
-            if cell is None:
-                left_out.append(SkippedJob(what=job.name, why="it did not fit into the time limit", late=True))
-                continue
-            known = {**known, job.name: cell}
-            save([known[one.name] for one in listed if one.name in known])
-        if job.samples is not None:
-            seconds[way] = samples, cell.seconds.median * cell.repeats
-    return [known[job.name] for job in listed if job.name in known], left_out
+def cell_of(setting: Setting, repeats: list[Repeat]) -> Cell:
+    """Return the cell of a setting: quantiles over its repeats, and the largest memory and number of samples."""
+    errors, seconds, memory, mses, samples = (
+        [value for value in values if value is not None] for values in zip(*repeats, strict=True)
+    )
+    columns = {"error": errors, "seconds": seconds, "mse": mses}
+    numbers: dict[str, Any] = {
+        f"{name}{suffix}": float(np.quantile(values, share)) if values else None
+        for name, values in columns.items()
+        for suffix, share in QUANTILES.items()
+    }
+    if setting.samples is None:
+        numbers["samples"] = max(samples, default=None)
+    return Cell(
+        **setting.model_dump() | numbers,
+        repeats=len(repeats),
+        error_unit=UNITS[setting.stage],
+        memory=max(memory, default=None),
+        scatter=float(np.std(np.log(errors), ddof=1)) if len(errors) > 1 and min(errors) > 0 else None,
+    )
 
 
 def _check_flat(scene: Scene) -> None:
@@ -159,7 +189,8 @@ def _fingerprint(setup: Setup) -> str:
     return fingerprint([setup.camera.describe(), tables, digest(setup.image.astype("float32"))])
 
 
-def _previous(folder: Path, subject_print: str) -> BenchTable | None:
+def _previous(folder: Path, made_of: str) -> BenchTable | None:
+    """Return the table of a folder, None if there is none of this scene and these libraries."""
     path = folder / JSON
     if not path.exists():
         return None
@@ -167,36 +198,27 @@ def _previous(folder: Path, subject_print: str) -> BenchTable | None:
         previous = bench_file.read(path)
     except InputError:  # damaged: measure again
         return None
-    if previous.scene != subject_print:
+    if previous.fingerprint != made_of:
         raise InputError(
             f"{path}: is of another scene, '{previous.title}', or of other values of its keys; choose another folder"
             " with -o"
         )
-    return previous if previous.fingerprint == _made_from(subject_print) else None
+    return previous if previous.versions == _libraries() else None
 
 
-def _made_from(subject_print: str) -> str:
-    return fingerprint([subject_print, versions("mitsuba", "drjit", "scipy")])
+def _libraries() -> dict[str, str]:
+    return versions("mitsuba", "drjit", "scipy")
 
 
 def rows(table: BenchTable) -> list[tuple[str, str]]:
     """Return the rows of the printed table: slopes, recommended settings, and what was left out."""
-    lines: list[tuple[str, str]] = []
-    for curve in table.curves:
-        if curve.slope is None or curve.slope_deviation is None:
-            continue
-        theory = "" if curve.theory is None else f", theory {curve.theory:g}"
-        agreement = "" if curve.agrees is None else (": agrees" if curve.agrees else ": does not agree")
-        name = f"slope, {curve.stage} {curve.way}, {curve.variant}"
-        lines.append((name, f"{curve.slope:.3f} ± {curve.slope_deviation:.3f}{theory}{agreement}"))
-    for stage in STAGES:
-        best = table.recommended.of(stage)
-        if best is None:
-            continue
-        words = [word for word in (best.method, best.setting, best.sampler, best.variant) if word]
-        if best.samples is not None:
-            words.append(f'samples = "{AUTO}"' if best.samples == AUTO else f"{best.samples} samples")
-        lines.append((f"recommended, {stage}", f"{', '.join(words)}, {best.seconds:.2g} s"))
+    known = [curve for curve in table.curves if curve.words]
+    lines = [(f"slope, {curve.stage} {curve.way}, {curve.variant}", curve.words) for curve in known]
+    for cell in table.recommended.cells:
+        way = AUTO if cell.way == DENSE else cell.way
+        samples = f"{cell.samples} samples" if cell.counted else f'samples = "{AUTO}"'
+        words = [way, cell.setting] if cell.samples is None else [way, cell.variant, samples]
+        lines.append((f"recommended, {cell.stage}", f"{', '.join(filter(None, words))}, {cell.seconds:.2g} s"))
     lines.append(("why", table.recommended.why))
     lines.append(("cells", f"{len(table.cells)} in {table.seconds:.0f} s, compared with {table.against}"))
     late = sum(job.late for job in table.left_out)

@@ -10,14 +10,13 @@ from math import log
 from pathlib import Path
 from typing import Any
 
-from ommatid.figures.saving import COLOURS, MARKERS, SCREEN_PNG, FigureFiles, log_ticks, new_figure, own_style
+from ommatid.figures.curves import FRONT, MORE_COLOURS, Style, cycled, draw_curve, draw_level, label, legend
+from ommatid.figures.saving import MARKERS, SCREEN_PNG, FigureFiles, log_ticks, new_figure, own_style
 from ommatid.runtime.printable import printable_label
 
-from .slopes import TOLERANCE, median_error, median_seconds, pareto_front
-from .table import AUTO, STAGES, BenchTable, Cell, ConvergenceCurve, Quantiles, Stage
+from .slopes import TOLERANCE, pareto_front
+from .table import AUTO, STAGES, BenchTable, Cell, Stage
 
-MORE_COLOURS = (*COLOURS, "#7A4F9A", "#555555")
-FRONT: dict[str, Any] = {"color": "0.75", "linewidth": 7, "alpha": 0.6, "solid_capstyle": "round"}
 NAMES: dict[Stage, str] = {"render": "Rendering", "calibrate": "Calibration", "reconstruct": "Reconstruction"}
 ERRORS: dict[Stage, str] = {
     "render": "error of the rendering: RMS over sensor pixels (grey levels)",
@@ -25,9 +24,12 @@ ERRORS: dict[Stage, str] = {
     "reconstruct": "numerical error: RMS over pixels (posterior standard deviations)",
 }
 IMAGES: dict[Stage, str] = {"render": "exact H", "calibrate": "exact light", "reconstruct": "exact light and H"}
-IMAGE_ERROR = "mean squared error of the image (grey levels squared)"
-
-Key = tuple[str, str | None]  # way and variant
+LABELS = {
+    "samples": "samples per pixel",
+    "seconds": "time (s)",
+    "mse": "mean squared error of the image (grey levels squared)",
+}
+SHOWN = 0.3  # of the least error of the curves, below which nothing is drawn: only rounding is left
 
 
 @own_style()
@@ -43,52 +45,54 @@ def write_figures(folder: Path, table: BenchTable, files: FigureFiles = SCREEN_P
 def _draw(figure: Any, table: BenchTable, stage: Stage) -> None:
     """Draw error against samples where a stage takes them, error against seconds, and the image's against seconds."""
     figure.suptitle(f"{NAMES[stage]}: {printable_label(table.title)}")
-    cells = table.of(stage)
-    axes = [("seconds", "error"), ("seconds", "mse")]
-    if stage != "reconstruct":
-        axes.insert(0, ("samples", "error"))
-    panels = figure.subplots(1, len(axes))
-    for panel, (across, along) in zip(panels, axes, strict=True):
-        _prepare(panel)
-        least = 0.3 * min(
-            (y.median for cell in cells if cell.counted and (y := getattr(cell, along)) and y.median), default=0.0
-        )
-        for key, style in _styles(cells).items():
-            _draw_cells(panel, [cell for cell in cells if (cell.way, cell.variant) == key], style, across, along, least)
-        panel.set_xlabel("samples per pixel" if across == "samples" else "time (s)")
-        panel.set_ylabel(ERRORS[stage] if along == "error" else IMAGE_ERROR)
-    *first, cost, image = panels
-    for panel in first:
-        panel.set_title(f"Convergence: slope ± standard error\nReference: {table.against}", fontsize=10)
-        panel.set_xticks(sorted({4 ** round(log(cell.samples, 4)) for cell in cells if cell.samples}))
-        panel.minorticks_off()
-    cost.set_title("Cost", fontsize=10)
-    image.set_title(f"Error of the image with {IMAGES[stage]}", fontsize=10)
-    front = [cell for cell in pareto_front(cells, median_seconds, median_error) if median_error(cell) > 0]
-    least = 0.3 * min((median_error(cell) for cell in cells if cell.counted), default=0.0)
-    if front:  # an exact answer is no point of a logarithmic axis
-        errors = [max(median_error(cell), least) for cell in front]
-        cost.plot([median_seconds(cell) for cell in front], errors, zorder=1, **FRONT)
-    if stage == "render" and table.noise_deviation > 0:
-        for panel in (*first, cost):
-            _draw_level(panel, table.noise_deviation, f"noise of the sensor, {table.noise_deviation:.2g}")
+    cells, labels = table.of(stage), {**LABELS, "error": ERRORS[stage]}
+    titles = {
+        ("samples", "error"): f"Convergence: slope ± standard error\nReference: {table.against}",
+        ("seconds", "error"): "Cost",
+        ("seconds", "mse"): f"Error of the image with {IMAGES[stage]}",
+    }
     if stage == "reconstruct":
-        _draw_level(cost, 0.1, "0.1 posterior standard deviations: 1 % of the mean squared error")
-    _draw_floor(image, table)
-    _mark_recommended(image, table, stage)
-    _draw_legend(figure, table, stage)
+        del titles["samples", "error"]
+    panels = dict(zip(titles, figure.subplots(1, len(titles)), strict=True))
+    styles = _styles(cells)
+    for (x, y), panel in panels.items():
+        label(panel, titles[x, y], labels[x], labels[y], "xy")
+        log_ticks(panel.xaxis)
+        for key, style in styles.items():
+            _draw_way(panel, [cell for cell in cells if (cell.way, cell.variant) == key], style, (x, y), cells)
+        if y == "error" and stage == "render" and table.noise_deviation > 0:
+            draw_level(panel, table.noise_deviation, f"noise of the sensor, {table.noise_deviation:.2g}")
+        if x == "samples":
+            panel.set_xticks(sorted({4 ** round(log(cell.samples, 4)) for cell in cells if cell.samples}))
+            panel.minorticks_off()
+    cost = panels["seconds", "error"]
+    front = pareto_front([cell for cell in cells if cell.error > 0], lambda cell: cell.seconds, lambda cell: cell.error)
+    rows = [{"seconds": cell.seconds, "error": max(cell.error, _least(cells, "error"))} for cell in front]
+    draw_curve(cost, rows, "seconds", "error", zorder=1, **FRONT)
+    if stage == "reconstruct":
+        draw_level(cost, 0.1, "0.1 posterior standard deviations: 1 % of the mean squared error")
+    _draw_floor(panels["seconds", "mse"], table)
+    _mark_recommended(panels["seconds", "mse"], table, stage)
+    slopes = {
+        (curve.way, curve.variant): curve.words or "too few cells for a slope"
+        for curve in table.curves
+        if curve.stage == stage
+    }
+    names = [", ".join(word for word in (*key, slopes.get(key)) if word) for key in styles]
+    note = f"Pareto front; {AUTO}: adaptive number of samples" if stage != "reconstruct" else "Pareto front"
+    entries = zip([*styles.values(), FRONT], [*names, note], strict=True)
+    legend(figure, entries, loc="outside lower center", ncols=3)
 
 
-def _styles(cells: Sequence[Cell]) -> dict[Key, dict[str, Any]]:
-    """Return the options of matplotlib's `plot` for each way: a colour and a marker, hollow for slow backends."""
+def _styles(cells: Sequence[Cell]) -> dict[tuple[str, str | None], Style]:
+    """Return the style of each way and variant: a colour and a marker, hollow for slow backends."""
     ways = list(dict.fromkeys(cell.way for cell in cells))
-    styles: dict[Key, dict[str, Any]] = {}
+    styles: dict[tuple[str, str | None], Style] = {}
     for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in cells):
-        index, hollow = ways.index(way), (variant or "").startswith("scalar")
-        colour = MORE_COLOURS[index % len(MORE_COLOURS)]
+        colour, hollow = cycled(ways.index(way), MORE_COLOURS), (variant or "").startswith("scalar")
         styles[way, variant] = {
             "color": colour,
-            "marker": MARKERS[index % len(MARKERS)],
+            "marker": cycled(ways.index(way), MARKERS),
             "markersize": 5,
             "markerfacecolor": "white" if hollow else colour,
             "linewidth": 1.1,
@@ -97,50 +101,30 @@ def _styles(cells: Sequence[Cell]) -> dict[Key, dict[str, Any]]:
     return styles
 
 
-def _prepare(panel: Any) -> None:
-    panel.set_xscale("log")
-    panel.set_yscale("log")
-    log_ticks(panel.xaxis)
-    panel.grid(visible=True, which="major", color="0.9")
-    panel.set_axisbelow(True)
+def _least(cells: Sequence[Cell], y: str) -> float:
+    """Return the lower end of a panel; of smaller errors the name states the value."""
+    return SHOWN * min((getattr(cell, y) for cell in cells if cell.counted and getattr(cell, y)), default=0.0)
 
 
-def _draw_cells(
-    panel: Any, cells: Sequence[Cell], style: dict[str, Any], across: str, along: str, least: float
-) -> None:
+def _draw_way(panel: Any, cells: Sequence[Cell], style: Style, axes: tuple[str, str], every: Sequence[Cell]) -> None:
     """Draw the cells of a way as a curve, those with a setting of their own as single points with its name.
 
-    across, along : names of the numbers at x and y
-    least : lower end of the panel: of smaller errors, where only rounding is left, the name states the value
+    every : cells of the panel
     """
-    known: list[tuple[float, Quantiles, Cell]] = []
-    for cell in sorted(cells, key=lambda cell: cell.samples or 0):
-        x, y = cell.samples if across == "samples" else cell.seconds.median, getattr(cell, along)
-        if x is not None and y is not None and y.median > 0:
-            known.append((x, y, cell))
-    curve = [(x, y) for x, y, cell in known if cell.counted and cell.samples is not None]
-    single = [(x, y) for x, y, _ in known if y.median >= least and (x, y) not in curve]
-    for points, options in ((curve, style), (single, {**style, "linestyle": "none"})):
-        if not points:  # which Matplotlib warns of on a logarithmic axis
+    (x, y), least = axes, _least(every, axes[1])
+    rows = [cell.model_dump() for cell in cells if getattr(cell, x) is not None and (getattr(cell, y) or 0.0) > 0]
+    draw_curve(panel, [row for row in rows if row["samples"] and row["setting"] != AUTO], x, y, **style)
+    for row in rows:
+        if row["samples"] and row["setting"] != AUTO:
             continue
-        below = [max(y.median - y.low, 0.0) for _, y in points]
-        above = [y.high - y.median for _, y in points]
-        medians = [y.median for _, y in points]
-        panel.errorbar([x for x, _ in points], medians, yerr=[below, above], elinewidth=0.8, capsize=1.5, **options)
-    for x, y, cell in known:
-        if cell.samples is None or not cell.counted:
-            name, offset = cell.setting.split(",")[0], {"xytext": (6, 4), "textcoords": "offset points", "fontsize": 8}
-            if y.median < least:
-                panel.plot(x, least, **style)
-                name = f"{name}, below: {y.median:.1g}"
-            panel.annotate(name, (x, max(y.median, least)), color=style["color"], **offset)
-    if len({x for x, _, _ in known}) == 1:  # around a single value, limits of a logarithmic axis may coincide
-        panel.update_datalim([(factor * known[0][0], 1.0) for factor in (0.5, 2.0)], updatey=False)
-
-
-def _draw_level(panel: Any, value: float, label: str, side: str = "bottom") -> None:
-    panel.axhline(value, color="0.35", linewidth=1, linestyle=":", zorder=2)
-    panel.text(0.01, value, label, transform=panel.get_yaxis_transform(), va=side, fontsize=8, color="0.3")
+        name, value = row["setting"].split(",")[0], row[y]
+        if value < least:
+            name, row = f"{name}, below: {value:.1g}", {x: row[x], y: least}
+        draw_curve(panel, [row], x, y, **style)
+        place: Style = {"xytext": (6, 4), "textcoords": "offset points", "fontsize": 8}
+        panel.annotate(name, (row[x], row[y]), color=style["color"], **place)
+    if len({row[x] for row in rows}) == 1:  # around a single value, limits of a logarithmic axis may coincide
+        panel.update_datalim([(factor * rows[0][x], 1.0) for factor in (0.5, 2.0)], updatey=False)
 
 
 def _draw_floor(panel: Any, table: BenchTable) -> None:
@@ -149,33 +133,13 @@ def _draw_floor(panel: Any, table: BenchTable) -> None:
         panel.axhspan(floor, floor * (1 + TOLERANCE), color="#009E73", alpha=0.15, linewidth=0, zorder=0)
         low, high = panel.get_ylim()
         panel.set_ylim(min(low, floor / (high / floor) ** 0.08), high)
-        _draw_level(panel, floor, f"noise floor {floor:.3g}, and {100 * TOLERANCE:g} % above it", "top")
+        draw_level(panel, floor, f"noise floor {floor:.3g}, and {100 * TOLERANCE:g} % above it", "top")
 
 
 def _mark_recommended(panel: Any, table: BenchTable, stage: Stage) -> None:
-    best = table.recommended.of(stage)
-    for cell in table.of(stage):
-        if best is not None and cell.seconds.median == best.seconds and cell.mse is not None:
-            point = cell.seconds.median, cell.mse.median
-            panel.plot(*point, marker="o", markersize=15, markerfacecolor="none", color="black", zorder=5)
-            label = "recommended" if table.recommended.reached else "nearest"
-            panel.annotate(label, point, xytext=(0, 12), textcoords="offset points", ha="center", fontsize=9)
-
-
-def _draw_legend(figure: Any, table: BenchTable, stage: Stage) -> None:
-    """Name the ways with their slopes, below all panels."""
-    from matplotlib.lines import Line2D
-
-    slopes = {(curve.way, curve.variant): _slope_words(curve) for curve in table.curves if curve.stage == stage}
-    styles = _styles(table.of(stage))
-    lines: list[Any] = [*(Line2D([], [], **style) for style in styles.values()), Line2D([], [], **FRONT)]
-    names = [", ".join(word for word in (*key, slopes.get(key)) if word) for key in styles]
-    note = f"Pareto front; {AUTO}: adaptive number of samples" if stage != "reconstruct" else "Pareto front"
-    figure.legend(lines, [*names, note], loc="outside lower center", ncols=3, fontsize=9)
-
-
-def _slope_words(curve: ConvergenceCurve) -> str:
-    if curve.slope is None or curve.slope_deviation is None:
-        return "too few cells for a slope"
-    theory = "" if curve.theory is None else f" (theory {curve.theory:g})"
-    return f"{curve.slope:.3f} ± {curve.slope_deviation:.3f}{theory}"
+    best = getattr(table.recommended, stage)
+    if best is not None and best.mse is not None:
+        point = best.seconds, best.mse
+        panel.plot(*point, marker="o", markersize=15, markerfacecolor="none", color="black", zorder=5)
+        words = "recommended" if table.recommended.reached else "nearest"
+        panel.annotate(words, point, xytext=(0, 12), textcoords="offset points", ha="center", fontsize=9)

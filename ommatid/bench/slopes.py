@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import product
 from math import inf
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,84 +17,88 @@ from ommatid.scenes.shrinkage import shrink_variances
 from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.sampling.passes import FEWEST_PASSES
 
-from .convergence import corners, law
-from .table import AUTO, DENSE, STAGES, Cell, ConvergenceCurve, Recommendation, RecommendedSetting, Stage
+from .table import AUTO, STAGES, Cell, ConvergenceCurve, Recommendation, Stage
 
 Item = TypeVar("Item")
 
 ROUNDING: dict[Stage, float] = {"render": 1e-5 * WHITE, "calibrate": 1e-5}  # errors below these are float32 rounding
-CRITICAL_SCORE = 3.0  # standard errors within which a slope agrees with theory
+IN_THE_LIMIT = 64  # samples in a pass: with fewer, strata that hold a corner are not few beside those along an edge
 FEWEST_POINTS = 3  # of a fitted slope
 TOLERANCE = 0.1  # relative excess over the noise floor that recommended settings may add in total
 SAMPLES_KEYS = {"render": "render.samples", "calibrate": "calibration.samples"}
 
 
-@dataclass(frozen=True)
-class Slope:
-    """d log error / d log samples, and its standard error."""
+class Law(NamedTuple):
+    """Theoretical slope of the error of a mean over rays, d log error / d log samples; None where theory has none.
 
-    value: float
-    deviation: float
+    why : the theory in one sentence;  least : samples in one pass from which the law holds
+    """
 
-    def agrees(self, theory: float, margin: float = 0.0) -> bool:
-        """Return True if the slope is within 3 standard errors, plus `margin`, of the theoretical slope."""
-        return abs(self.value - theory) <= CRITICAL_SCORE * self.deviation + margin
+    slope: float | None
+    why: str
+    least: int = 1
 
 
-def slope(cells: Sequence[Cell]) -> Slope | None:
-    """Fit the slope of cells that differ only in samples, by weighted least squares on logarithms.
+def law(sampler: Sampler, camera: Camera) -> Law:
+    """Return the law of a sampler in front of a camera's lenses and a flat target, constant over each pixel of f."""
+    if sampler == "independent":
+        return Law(-0.5, "independent samples: the variance of a mean of n is 1/n of one's")
+    if not all(lens_type.optics.is_pinhole for lens_type in camera.types):
+        why = "rays differ in four or six numbers, and the sampler stratifies them only two by two"
+        return Law(None, why, IN_THE_LIMIT)
+    if sampler == "ldsampler":
+        why = "theory gives only a bound: of order log(n)/n (Koksma and Hlawka), which is no slope"
+        return Law(None, why, IN_THE_LIMIT)
+    why = "of n strata only those along edges, some n^1/2, err: n^1/2 / n^2 of variance (Mitchell 1996), for large n"
+    return Law(-0.75, why, IN_THE_LIMIT)
+
+
+def slope(cells: Sequence[Cell]) -> tuple[float, float] | None:
+    """Fit the slope of cells that differ only in samples, by weighted least squares on logarithms; and its error.
 
     Returns None for fewer than three different numbers of samples. Each point is weighted by the inverse variance of
     its median logarithm over seeds; these variances are shrunk towards one another, since few repeats determine each of
     them poorly. The standard error follows from those variances, whether or not the points lie on a line.
     """
-    known = [cell for cell in cells if cell.scatter and cell.samples and cell.repeats > 1 and cell.error.median > 0]
+    known = [cell for cell in cells if cell.scatter and cell.samples and cell.repeats > 1 and cell.error > 0]
     if len({cell.samples for cell in known}) < FEWEST_POINTS:
         return None
     x = np.log([float(cell.samples or 1) for cell in known])
-    y = np.log([cell.error.median for cell in known])
+    y = np.log([cell.error for cell in known])
     repeats = np.array([cell.repeats for cell in known])
     scatter = np.square([cell.scatter or 0.0 for cell in known])
     weight = 1 / (shrink_variances(scatter, int(repeats.min())) * variance_of_median(repeats))
     line, covariance = np.polyfit(x, y, 1, w=np.sqrt(weight), cov="unscaled")
-    return Slope(float(line[0]), float(covariance[0, 0]) ** 0.5)
+    return float(line[0]), float(covariance[0, 0]) ** 0.5
 
 
 def curves(cells: Sequence[Cell], camera: Camera) -> list[ConvergenceCurve]:
     """Return the slope of each method of rendering and calibration, and its theoretical slope."""
-    fitted: list[ConvergenceCurve] = []
-    for stage, limit in ROUNDING.items():
-        counted = [cell for cell in cells if cell.stage == stage and cell.counted]
-        for way, variant in dict.fromkeys((cell.way, cell.variant) for cell in counted):
-            used = [cell for cell in counted if (cell.way, cell.variant) == (way, variant)]
-            fitted.append(_curve([cell for cell in used if cell.error.median > limit], camera, stage, way, variant))
-    return fitted
+    ways: dict[tuple[Stage, str, str | None], list[Cell]] = {}
+    for cell in cells:
+        if cell.stage in ROUNDING and cell.counted:
+            ways.setdefault((cell.stage, cell.way, cell.variant), []).append(cell)
+    return [_curve(of_way, camera) for of_way in ways.values()]
 
 
-def _curve(cells: Sequence[Cell], camera: Camera, stage: Stage, way: str, variant: str | None) -> ConvergenceCurve:
-    theory = law(cast(Sampler, way.split(", ")[-1]), camera)
-    asymptotic = theory.least > 1
-    used = [cell for cell in cells if not asymptotic or (cell.samples or 0) >= theory.least * FEWEST_PASSES]
-    fit, why, agrees = slope(used), theory.why, None
+def _curve(cells: Sequence[Cell], camera: Camera) -> ConvergenceCurve:
+    first = cells[0]
+    theory = law(cast(Sampler, first.sampler), camera)
+    least = theory.least * FEWEST_PASSES if theory.least > 1 else 0
+    fit = slope([cell for cell in cells if cell.error > ROUNDING[first.stage] and (cell.samples or 0) >= least])
+    why = theory.why
     if fit is None:
         why += "; fewer than three cells to fit, or errors at the level of rounding"
-    elif asymptotic:
-        why += f"; fitted from {theory.least * FEWEST_PASSES} samples on"
-    if fit is not None and theory.slope is not None:
-        counts = [(cell.samples or 1) // FEWEST_PASSES for cell in used]
-        margin = corners(camera, min(counts), max(counts)) if asymptotic else 0.0
-        if 0 < margin < inf:
-            why += f", where strata that contain corners may change it by {margin:.2g}"
-        agrees = None if margin == inf else fit.agrees(theory.slope, margin)
+    elif least:
+        why += f"; fitted from {least} samples on"
     return ConvergenceCurve(
-        stage=stage,
-        way=way,
-        variant=variant,
-        slope=None if fit is None else fit.value,
-        slope_deviation=None if fit is None else fit.deviation,
+        stage=first.stage,
+        way=first.way,
+        variant=first.variant,
+        slope=fit and fit[0],
+        slope_deviation=fit and fit[1],
         theory=theory.slope,
         why=why,
-        agrees=agrees,
     )
 
 
@@ -108,26 +111,16 @@ def variance_of_median(repeats: NDArray[Any]) -> FloatArray:
     return np.pi / (2 * repeats + np.pi - 2)
 
 
-def median_seconds(cell: Cell) -> float:
-    """Return the median duration of a cell, the cost in its Pareto front."""
-    return cell.seconds.median
-
-
-def median_error(cell: Cell) -> float:
-    """Return the median error of a cell."""
-    return cell.error.median
-
-
 def excess(cell: Cell, floor: float) -> float:
     """Return the relative increase of the mean squared error over `floor` that is due to one setting.
 
     An estimate with an error of e posterior standard deviations adds e^2.
     """
     if cell.stage == "reconstruct":
-        return cell.error.median**2
+        return cell.error**2
     if cell.mse is None or floor <= 0:
         return inf
-    return max(cell.mse.median / floor - 1, 0.0)
+    return max(cell.mse / floor - 1, 0.0)
 
 
 def recommend(cells: Sequence[Cell], floor: float) -> Recommendation:
@@ -136,81 +129,42 @@ def recommend(cells: Sequence[Cell], floor: float) -> Recommendation:
     floor : mean squared error with exact light and exact H, with the scene's noise
     Rendering and calibration share the scene's sampler and variant.
     """
+
+    def total(choice: Sequence[Cell]) -> float:
+        return sum(excess(cell, floor) for cell in choice)
+
     choices = list(_choices(cells, floor))
     if floor <= 0 or not choices:
         why = "no cell of some stage was measured within the time limit; raise --within"
         if floor <= 0:
             why = "the scene has no noise, so there is no noise floor: more samples always reduce the error"
-        return Recommendation(noise_floor=floor, mse=None, reached=False, why=why)
-    sufficient = [choice for choice in choices if _total_excess(choice, floor) <= TOLERANCE]
-    if sufficient:
-        best = min(sufficient, key=_total_seconds)
-    else:
-        best = min(choices, key=lambda choice: _total_excess(choice, floor))
-    total = _total_excess(best, floor)
+        return Recommendation(noise_floor=floor, why=why)
+    sufficient = [choice for choice in choices if total(choice) <= TOLERANCE]
     limit = f"within {100 * TOLERANCE:g} % of the error with exact light and exact H"
     if sufficient:
-        reasons = [f"the cheapest {limit}: {round(100 * total, 4):.2g} % above it"]
+        best = min(sufficient, key=lambda choice: sum(cell.seconds for cell in choice))
+        reasons = [f"the cheapest {limit}: {round(100 * total(best), 4):.2g} % above it"]
     else:
-        reasons = [f"no measured setting is {limit}; these are the nearest, {100 * total:.0f} % above it"]
+        best = min(choices, key=total)
+        reasons = [f"no measured setting is {limit}; these are the nearest, {100 * total(best):.0f} % above it"]
     reasons += [
         f'{SAMPLES_KEYS[cell.stage]} = "{AUTO}" took up to {cell.samples} samples per pixel'
         for cell in best
         if not cell.counted
     ]
-    render, calibrate, reconstruct = (_recommended(cell) for cell in best)
-    return Recommendation(
-        noise_floor=floor,
-        mse=floor * (1 + total),
-        reached=bool(sufficient),
-        why="; ".join(reasons),
-        render=render,
-        calibrate=calibrate,
-        reconstruct=reconstruct,
-    )
+    mse, chosen = floor * (1 + total(best)), {cell.stage: cell for cell in best}
+    return Recommendation(noise_floor=floor, mse=mse, reached=bool(sufficient), why="; ".join(reasons), **chosen)
 
 
 def _choices(cells: Sequence[Cell], floor: float) -> Iterator[tuple[Cell, ...]]:
     """Yield a cell of each stage, in the order of STAGES; rendering and calibration share a sampler and variant."""
-    for key in dict.fromkeys(_sampler_and_variant(cell) for cell in cells if cell.stage == "render"):
-        usable = [cell for cell in cells if cell.stage == "reconstruct" or _sampler_and_variant(cell) == key]
-        yield from product(
-            *(
-                pareto_front(
-                    [cell for cell in usable if cell.stage == stage and excess(cell, floor) < inf],
-                    median_seconds,
-                    lambda cell: excess(cell, floor),
-                )
-                for stage in STAGES
-            )
-        )
-
-
-def _sampler_and_variant(cell: Cell) -> tuple[str, str | None]:
-    return cell.way.split(", ")[-1], cell.variant
-
-
-def _total_excess(choice: Sequence[Cell], floor: float) -> float:
-    return sum(excess(cell, floor) for cell in choice)
-
-
-def _total_seconds(choice: Sequence[Cell]) -> float:
-    return sum(median_seconds(cell) for cell in choice)
-
-
-def _recommended(cell: Cell) -> RecommendedSetting:
-    seconds = cell.seconds.median
-    if cell.stage == "reconstruct":
-        method = AUTO if cell.way == DENSE else cell.way
-        return RecommendedSetting(method=method, setting=cell.setting, seconds=seconds)
-    *method, sampler = cell.way.split(", ")
-    return RecommendedSetting(
-        method=method[0] if method else None,
-        sampler=sampler,
-        variant=cell.variant,
-        samples=cell.samples if cell.counted else AUTO,
-        seconds=seconds,
-    )
+    for key in dict.fromkeys((cell.sampler, cell.variant) for cell in cells if cell.stage == "render"):
+        fronts: list[list[Cell]] = []
+        for stage in STAGES:
+            of_stage = [cell for cell in cells if cell.stage == stage and excess(cell, floor) < inf]
+            usable = [cell for cell in of_stage if stage == "reconstruct" or (cell.sampler, cell.variant) == key]
+            fronts.append(pareto_front(usable, lambda cell: cell.seconds, lambda cell: excess(cell, floor)))
+        yield from product(*fronts)
 
 
 def pareto_front(items: Iterable[Item], cost: Callable[[Item], float], error: Callable[[Item], float]) -> list[Item]:

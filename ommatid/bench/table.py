@@ -1,8 +1,6 @@
 """Results of `ommatid bench` on disk: bench.json, which other commands read, and bench.csv, one row per cell.
 
-A cell is one setting of one stage: its cost in seconds and memory, and the error of its result. The unit of the error
-depends on the stage: `render`, root mean square over sensor pixels in pixel values of f; `calibrate`, over the entries
-of H; `reconstruct`, over the pixels of f in units of each pixel's posterior standard deviation.
+A cell is one setting of one stage: its cost in seconds and memory, and the error of its result.
 """
 
 from __future__ import annotations
@@ -12,74 +10,81 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import write_csv, write_text
+from ommatid.runtime.files import write_text
 from ommatid.runtime.input_files import read_record, real_path
+from ommatid.runtime.study import write_rows
 
 JSON, CSV = "bench.json", "bench.csv"
 DENSE = "dense"  # one dense problem, which estimator.method = "auto" takes where it fits
 AUTO = "auto"  # the setting of a cell with an adaptive number of samples: a single point, not part of a curve
-QUANTILES = 0.1, 0.5, 0.9
 
 Value = TypeVar("Value")
 OrAbsent = Annotated[Value | None, Field(exclude_if=lambda value: value is None)]  # no value: no key in the file
 Stage = Literal["render", "calibrate", "reconstruct"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
-UNITS: dict[Stage, str] = {
-    "render": "values of f",
-    "calibrate": "entries of H",
-    "reconstruct": "posterior standard deviations",
-}
 
 
 class _Record(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
-class Quantiles(_Record):
-    """Median, 10 % and 90 % quantile over repeats with independent seeds."""
-
-    median: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, values: list[float]) -> Quantiles:
-        """Return the quantiles of at least one value, interpolated linearly between values."""
-        low, median, high = np.quantile(values, QUANTILES).tolist()
-        return cls(median=median, low=low, high=high)
-
-
-class Cell(_Record):
-    """Measurements of one setting of a stage.
+class Setting(_Record):
+    """A setting of a stage.
 
     way : the sampler, the method of calibration and its sampler, "dense", "tiles" or "frame"
-    samples : per pixel; of an adaptive cell the largest number at any pixel in any repeat
+    samples : per pixel, None for those of an adaptive setting before it is measured
     setting : the remaining parameters
-    scatter : standard deviation of the natural logarithm of the error over repeats, None for a single repeat
-    memory : peak memory of the process in bytes, None where the system does not report it
-    mse : mean squared error of the image with this setting, the scene's noise, and the other stages exact
     """
 
     stage: Stage
     way: str
-    variant: str | None
-    samples: int | None
+    variant: str | None = None
+    samples: int | None = None
     setting: str
-    repeats: int
-    error: Quantiles
-    seconds: Quantiles
-    memory: int | None
-    mse: Quantiles | None
-    scatter: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Readable name."""
+        samples = f"{self.samples} samples" if self.samples is not None and self.counted else None
+        return ", ".join(part for part in (f"{self.stage} {self.way}", self.variant, samples, self.setting) if part)
 
     @property
     def counted(self) -> bool:
-        """True if the number of samples was fixed beforehand, so that the cell can be part of a curve."""
+        """True if the number of samples was fixed beforehand, so that the setting can be part of a curve."""
         return self.setting != AUTO
+
+    @property
+    def sampler(self) -> str:
+        """The sampler, of a rendering or a calibration."""
+        return self.way.split(", ")[-1]
+
+
+class Cell(Setting):
+    """Medians over repeats with independent seeds, with 10 % and 90 % quantiles as `_low` and `_high`.
+
+    samples : of an adaptive cell the largest number at any pixel in any repeat
+    error : root mean square over sensor pixels, over the entries of H, or over pixels of f, in `error_unit`
+    memory : peak memory of the process in bytes, None where the system does not report it
+    mse : mean squared error of the image with this setting, the scene's noise, and the other stages exact
+    scatter : standard deviation of the natural logarithm of the error over repeats, None for a single repeat
+    """
+
+    repeats: int
+    error: float
+    error_low: float
+    error_high: float
+    error_unit: str
+    seconds: float
+    seconds_low: float
+    seconds_high: float
+    memory: int | None
+    mse: float | None
+    mse_low: float | None
+    mse_high: float | None
+    scatter: float | None = None
 
 
 class ConvergenceCurve(_Record):
@@ -88,8 +93,6 @@ class ConvergenceCurve(_Record):
     slope_deviation : standard error of the slope, from the scatter over seeds
     theory : theoretical slope, None where theory gives no number
     why : source of the theoretical slope, or the reason why there is none
-    agrees : True if the slope is within 3 standard errors of theory, plus what an asymptotic theory leaves open at the
-        numbers of samples of the fit, as `why` states
     """
 
     stage: Stage
@@ -99,10 +102,17 @@ class ConvergenceCurve(_Record):
     slope_deviation: float | None
     theory: float | None
     why: str
-    agrees: bool | None
+
+    @property
+    def words(self) -> str:
+        """The slope with its standard error and the theoretical one; empty where too few cells are known."""
+        if self.slope is None or self.slope_deviation is None:
+            return ""
+        theory = "" if self.theory is None else f" (theory {self.theory:g})"
+        return f"{self.slope:.3f} ± {self.slope_deviation:.3f}{theory}"
 
 
-class SkippedJob(_Record):
+class Skipped(_Record):
     """A cell that was not measured, and the reason; `late` if the only reason is the time limit."""
 
     what: str
@@ -110,19 +120,8 @@ class SkippedJob(_Record):
     late: bool = False
 
 
-class RecommendedSetting(_Record):
-    """Recommended setting of one stage; keys that do not apply to the stage are absent from the file."""
-
-    seconds: float
-    method: OrAbsent[str] = None
-    setting: OrAbsent[str] = None
-    sampler: OrAbsent[str] = None
-    variant: OrAbsent[str] = None
-    samples: OrAbsent[int | Literal["auto"]] = None
-
-
 class Recommendation(_Record):
-    """Cheapest settings that reach the noise floor; the stages are absent from the file if none was found.
+    """The cells of the cheapest settings that reach the noise floor; absent from the file if there are none.
 
     noise_floor : mean squared error of the image with exact light and exact H
     mse : expected mean squared error of the recommended settings
@@ -130,29 +129,29 @@ class Recommendation(_Record):
     """
 
     noise_floor: float
-    mse: float | None
-    reached: bool
+    mse: float | None = None
+    reached: bool = False
     why: str
-    render: OrAbsent[RecommendedSetting] = None
-    calibrate: OrAbsent[RecommendedSetting] = None
-    reconstruct: OrAbsent[RecommendedSetting] = None
+    render: OrAbsent[Cell] = None
+    calibrate: OrAbsent[Cell] = None
+    reconstruct: OrAbsent[Cell] = None
 
-    def of(self, stage: Stage) -> RecommendedSetting | None:
-        """Return the recommended setting of a stage, None if there is none."""
-        return {"render": self.render, "calibrate": self.calibrate, "reconstruct": self.reconstruct}[stage]
+    @property
+    def cells(self) -> list[Cell]:
+        """The cells, in the order of the stages; none if none are recommended."""
+        return [cell for cell in (self.render, self.calibrate, self.reconstruct) if cell is not None]
 
 
 class BenchTable(_Record):
     """Content of bench.json.
 
-    scene : fingerprint of the measured scene;  fingerprint : that of the scene and of the versions of the libraries
+    fingerprint : of the measured scene
     against : description of the reference for renderings and calibrations
     noise_deviation : standard deviation of the sensor's noise, in pixel values of f
     budget : time limit in seconds;  seconds : duration of all measurements
     """
 
     title: str
-    scene: str
     fingerprint: str
     camera: dict[str, Any]
     machine: dict[str, Any]
@@ -164,7 +163,7 @@ class BenchTable(_Record):
     cells: tuple[Cell, ...]
     curves: tuple[ConvergenceCurve, ...]
     recommended: Recommendation
-    left_out: tuple[SkippedJob, ...]
+    left_out: tuple[Skipped, ...]
 
     def of(self, stage: Stage) -> list[Cell]:
         """Return the cells of a stage."""
@@ -180,9 +179,7 @@ def write(folder: Path, table: BenchTable) -> None:
 
     Raises InputError or MachineError.
     """
-    rows = [row_of(cell) for cell in table.cells]
-    columns = list(rows[0]) if rows else list(Cell.model_fields)
-    write_csv(folder / CSV, columns, (row.values() for row in rows))
+    write_rows(folder / CSV, [cell.model_dump() for cell in table.cells], Cell.model_fields)
     write_text(folder / JSON, json.dumps(table.describe(), indent=2, allow_nan=False) + "\n")
 
 
@@ -207,17 +204,3 @@ def bench_tables(folder: Path, camera: Mapping[str, Any]) -> Iterator[BenchTable
             continue
         if table.camera == same_camera:
             yield table
-
-
-def row_of(cell: Cell) -> dict[str, Any]:
-    """Return a cell as a row of bench.csv by column; quantities with quantiles take three columns."""
-    row: dict[str, Any] = {}
-    for name, value in cell:
-        if name not in ("error", "seconds", "mse"):
-            row[name] = value
-            continue
-        for key in Quantiles.model_fields:
-            row[name if key == "median" else f"{name}_{key}"] = None if value is None else getattr(value, key)
-        if name == "error":
-            row["error_unit"] = UNITS[cell.stage]
-    return row

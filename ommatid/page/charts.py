@@ -20,7 +20,7 @@ from ommatid.analysis import resolution
 from ommatid.analysis.averaging_kernel import ErrorWindow, why_none
 from ommatid.analysis.resolution import Transfer
 from ommatid.bench.slopes import pareto_front
-from ommatid.bench.table import BenchTable
+from ommatid.bench.table import STAGES, BenchTable
 from ommatid.figures.saving import COLOURS, log_ticks, new_figure, own_style, svg_text
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.printable import printable_label
@@ -41,7 +41,6 @@ GROUPS = 12
 FEWEST_PIXELS = 20  # per group, on average
 CONFIDENCE = 0.99
 LOG_RATIO = 10  # ratio of the largest to the smallest error from which on the axes are logarithmic
-STAGE_COLOURS = {"render": 1, "calibrate": 2, "reconstruct": 3}
 Point = tuple[float, float]  # run time of a stage, and mean squared error of the image
 
 
@@ -229,8 +228,8 @@ def time_curves(run: Run, bench: BenchTable | None) -> tuple[Markup | str, str]:
     if bench is None or mse is None:
         return "", ""
     series: list[ChartSeries] = []
-    for stage, colour in STAGE_COLOURS.items():
-        measured = [(cell.seconds.median, cell.mse.median) for cell in bench.cells if cell.stage == stage and cell.mse]
+    for colour, stage in enumerate(STAGES, 1):
+        measured = [(cell.seconds, cell.mse) for cell in bench.cells if cell.stage == stage and cell.mse is not None]
         points: list[Point] = [point for point in measured if min(point) > 0]
         if points:
             front = pareto_front(points, lambda point: point[0], lambda point: point[1])

@@ -6,30 +6,22 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-from ommatid.bench.table import BenchTable, Cell, ConvergenceCurve, Quantiles, Recommendation, Stage
+from ommatid.bench.table import BenchTable, Cell, ConvergenceCurve, Recommendation, Stage
 from ommatid.scenes.camera import Camera
 
 
-def exactly(value: float) -> Quantiles:
-    """Quantiles of a quantity without scatter."""
-    return Quantiles(median=value, low=value, high=value)
-
-
 def cell(stage: Stage = "render", **values: Any) -> Cell:
-    """A cell of 16 independent samples with error, seconds and mean squared error 1, unless `values` say otherwise."""
+    """A cell of 16 independent samples with error, seconds and mean squared error 1, unless `values` say otherwise.
+
+    These have no scatter, so that their quantiles are equal.
+    """
     unit: dict[str, Any] = {
-        "way": "independent",
-        "variant": None,
-        "samples": 16,
-        "setting": "",
-        "repeats": 5,
-        "error": exactly(1.0),
-        "seconds": exactly(1.0),
-        "memory": None,
-        "mse": exactly(1.0),
-        "scatter": 0.05,
+        **{"way": "independent", "samples": 16, "setting": "", "repeats": 5, "memory": None, "scatter": 0.05},
+        **{"error": 1.0, "error_unit": "", "seconds": 1.0, "mse": 1.0},
+        **values,
     }
-    return Cell(stage=stage, **unit | values)
+    ends = {f"{name}_{end}": unit[name] for name in ("error", "seconds", "mse") for end in ("low", "high")}
+    return Cell(stage=stage, **ends | unit)
 
 
 def bench_table(
@@ -38,7 +30,6 @@ def bench_table(
     """The bench table of a camera with these cells and curves; `why` explains its recommendation."""
     return BenchTable(
         title="",
-        scene="",
         fingerprint="",
         camera=json.loads(json.dumps(camera.describe())),
         machine={},
@@ -49,6 +40,6 @@ def bench_table(
         seconds=1.0,
         cells=tuple(cells),
         curves=tuple(curves),
-        recommended=Recommendation(noise_floor=1.0, mse=None, reached=False, why=why),
+        recommended=Recommendation(noise_floor=1.0, why=why),
         left_out=(),
     )

@@ -23,6 +23,7 @@ from ommatid.runtime.errors import InputError
 
 from ..reference.cases import DESIGNED, NEIGHBOURS, NOISE, SENSOR, THREE, scene
 from .chain import PITCH
+from .rows import markdown
 
 Cell = dict[str, str | int]
 FREE = 16_000_000_000  # bytes of memory, half of which the estimator may take
@@ -113,17 +114,17 @@ def answer(cell: Cell, folder: Path) -> str:
     return str(described["plan"]["reconstruct"]["method"])
 
 
-def table(answers: Iterable[tuple[Cell, str]]) -> list[str]:
-    """Return the lines of a table of Markdown: the number of cells by their answer, of each camera and size."""
+def table(answers: Iterable[tuple[Cell, str]]) -> str:
+    """Return a table of Markdown: the number of cells by their answer, of each camera and size."""
     known = list(answers)
     heads = [said for said, _ in Counter(said for _, said in known).most_common()]
-    lines = [f"| cells | {' | '.join(heads)} |", f"| --- |{' ---: |' * len(heads)}"]
+    lines: list[list[str]] = []
     for name in ("camera", "size"):
         for level in FACTORS[name]:
             counted = Counter(said for cell, said in known if cell[name] == level)
-            words = f"{level} x {level}" if name == "size" else level
-            lines.append(f"| {words} | {' | '.join(str(counted[said]) for said in heads)} |")
-    return lines
+            words = f"{level} x {level}" if name == "size" else str(level)
+            lines.append([words, *(str(counted[said]) for said in heads)])
+    return markdown(["cells", *heads], lines)
 
 
 def command(words: list[str]) -> None:
@@ -131,4 +132,4 @@ def command(words: list[str]) -> None:
     del words
     with TemporaryDirectory(prefix="ommatid-cells-") as folder:
         levels = (dict(zip(FACTORS, each, strict=True)) for each in product(*FACTORS.values()))
-        print(*table((cell, answer(cell, Path(folder))) for cell in levels), sep="\n")
+        print(table((cell, answer(cell, Path(folder))) for cell in levels))

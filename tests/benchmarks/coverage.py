@@ -1,6 +1,6 @@
 """How often error bars are correct: `python -m tests.benchmarks coverage`.
 
-Every cell is run with many seeds, as `ommatid run` does it. The folder of a run keeps its run.json, so that a second
+Every cell is run with many seeds, as `ommatid run` does it. The journal keeps the content of run.json, so that a second
 start runs what is missing.
 """
 
@@ -18,15 +18,16 @@ from scipy import stats
 
 from ommatid.interface import calibrate, reconstruct, render, target_image
 from ommatid.reconstruct.expected_error import COVERAGE
-from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.run_json import RunReport
-from ommatid.runtime.errors import InputError
+from ommatid.runtime.study import Row, entries, study
 
 from .coverage_cells import CELLS, Cell
+from .rows import markdown, say_failed
 
 OUTSIDE = COVERAGE[0] + 1 - COVERAGE[1]  # share of errors outside correct intervals
 CHANCE = 2e-3  # that a cell of correct error bars has more misses than are allowed
 FEW = "†"
+JOURNAL = "coverage.jsonl"
 COLUMNS = (
     "cell",
     "runs",
@@ -52,30 +53,28 @@ def measured_run(cell: Cell, number: int) -> RunReport:
 
 def results(folder: Path, cell: Cell) -> dict[int, RunReport]:
     """Read the results of a cell by number; those of another definition of the cell do not count."""
-    read: dict[int, RunReport] = {}
-    for path in (folder / cell.name).glob(f"*/{run_json.RUN}"):
-        try:
-            report = run_json.read(path.parent)
-        except InputError:
-            continue  # damaged, so that it is run again
-        if report.fingerprint == cell.definition:
-            read[int(path.parent.name)] = report
-    return dict(sorted(read.items()))
+    rows = [entry["row"] for entry in entries(folder / JOURNAL)]
+    own = [row for row in rows if (row["cell"], row["definition"]) == (cell.name, cell.definition)]
+    own.sort(key=lambda row: row["number"])
+    return {row["number"]: RunReport.model_validate(row["report"]) for row in own}
 
 
-def complete(cell: Cell, folder: Path, seeds: int) -> None:
-    """Run what is missing of the first `seeds` runs of a cell; an error ends that run alone."""
-    finished = results(folder, cell)
-    for number in sorted({*range(seeds)} - {*finished}):
-        try:
-            report = measured_run(cell, number)
-        except Exception as error:
-            print(f"{cell.name} {number}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-            continue
-        place = folder / cell.name / str(number)
-        place.mkdir(parents=True, exist_ok=True)
-        run_json.write(place, report)
-        print(f"{cell.name} {number}: {_line(report)}", file=sys.stderr, flush=True)
+def complete(cells: Sequence[Cell], folder: Path, seeds: int | None) -> None:
+    """Run what is missing of the first `seeds` runs of cells; an error ends that run alone."""
+    by_name = {cell.name: cell for cell in cells}
+    listed = [
+        {"cell": cell.name, "definition": definition, "number": number}
+        for cell in cells
+        for definition in (cell.definition,)
+        for number in range(seeds or cell.seeds)
+    ]
+
+    def measure(row: Row) -> Row:
+        report = measured_run(by_name[row["cell"]], row["number"])
+        print(f"{row['cell']} {row['number']}: {_line(report)}", file=sys.stderr, flush=True)
+        return {"report": report.plain()}
+
+    study(folder / JOURNAL, listed, measure, say_failed, Exception)
 
 
 def is_inside(report: RunReport) -> bool | None:
@@ -142,8 +141,7 @@ def table(cells: Sequence[Cell], folder: Path) -> str:
     known = [(_marked(cell), list(results(folder, cell).values())) for cell in cells]
     known = [(name, reports) for name, reports in known if reports]
     failing = ", ".join(name for name, reports in known if not holds(reports))
-    lines = [COLUMNS, ("---", *["---:"] * (len(COLUMNS) - 1)), *(row(name, reports) for name, reports in known)]
-    text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    text = markdown(COLUMNS, (row(name, reports) for name, reports in known))
     few = f"{FEW} fewer samples than the scene asks for."
     return f"{text}\n\nCells with too many errors outside: {failing or 'none'}. {few}"
 
@@ -163,8 +161,7 @@ def command(arguments: Sequence[str]) -> None:
         print(f"{len(cells)} cells, some {hours:.1f} hours on two cores")
         return
     if not options.table:
-        for cell in cells:
-            complete(cell, options.out, options.seeds or cell.seeds)
+        complete(cells, options.out, options.seeds)
     print(table(cells, options.out))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ommatid.bench.cells import reset_peak_memory, resident_memory
+from ommatid.bench.cost import reset_peak_memory, resident_memory
 
 ROOT = Path(__file__).parents[2]
 

@@ -6,8 +6,6 @@ and the scene's sensor. The file of results has one line per run, so that a seco
 
 from __future__ import annotations
 
-import json
-import sys
 from argparse import ArgumentParser
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,9 +21,12 @@ from skimage import data
 from ommatid.pipeline.stages import checked_setup
 from ommatid.reconstruct.output import result_files
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.study import FAILED, study
 from ommatid.scenes.scene import Scene, parse
 from ommatid.simulate.ideal import ideal_model
 from ommatid.simulate.render import exposed
+
+from .rows import markdown, say_failed
 
 NOISES, BITS = (0.01, 1.0, 100.0), (8, 12)
 APART = 1.5  # ratio of the measured to the stated error, or its inverse, from which a green verdict is counted
@@ -163,20 +164,12 @@ def measured(run: Run, folder: Path) -> dict[str, Any]:
         mean, deviation = found.region((first, first), (side, side))
         scores.append((mean - float(truth[first : first + side, first : first + side].mean())) / deviation)
     return {
-        **run._asdict(),
         "stated": error.predicted_mse,
         "mse": error.mse,
         "interval": None if interval is None else [interval.low, interval.high],
         "level": report.verdict.level,
         "scores": scores,
     }
-
-
-def results(path: Path) -> dict[Run, dict[str, Any]]:
-    """Read the results of a file by run; none where there is no file."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    read = [json.loads(line) for line in lines]
-    return {Run(*(each[name] for name in Run._fields)): each for each in read}
 
 
 def row(found: Sequence[dict[str, Any]]) -> list[str]:
@@ -202,8 +195,7 @@ def table(every: Iterable[dict[str, Any]]) -> str:
         for name in ("all", each["camera"], each["picture"]):
             groups[name].append(each)
     names = [name for name in ("all", *CAMERAS, *PICTURES) if name in groups]
-    lines = [["pictures", *COLUMNS], ["---", *["---:"] * len(COLUMNS)], *([name, *row(groups[name])] for name in names)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return markdown(["pictures", *COLUMNS], ([name, *row(groups[name])] for name in names))
 
 
 def runs(size: int, seeds: int, cameras: Sequence[str]) -> Iterator[Run]:
@@ -220,16 +212,7 @@ def command(arguments: Sequence[str]) -> None:
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="runs of every cell; default: 5")
     parser.add_argument("--cameras", default=",".join(CAMERAS), metavar="NAME,...", help="default: all")
     options = parser.parse_args(arguments)
-    finished = results(options.out)
+    listed = [run._asdict() for run in runs(options.size, options.seeds, options.cameras.split(","))]
     with TemporaryDirectory(prefix="ommatid-") as folder:
-        for run in runs(options.size, options.seeds, options.cameras.split(",")):
-            if run in finished:
-                continue
-            try:
-                finished[run] = measured(run, Path(folder))
-            except Exception as error:
-                print(f"{run}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-                continue
-            with options.out.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(finished[run]) + "\n")
-    print(table(each for run, each in finished.items() if run.size == options.size))
+        found = study(options.out, listed, lambda cell: measured(Run(**cell), Path(folder)), say_failed, Exception)
+    print(table(row for row in found if FAILED not in row))

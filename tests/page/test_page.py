@@ -41,7 +41,7 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.formats import exr
 from ommatid.scenes.scene import parse
 
-from ..bench.tables import bench_table, cell, exactly
+from ..bench.tables import bench_table, cell
 from ..runs import report_of
 from .runs import F, letter_run, synthetic
 
@@ -351,8 +351,8 @@ def test_pixels_of_equal_deviation_are_one_group(run: data.Run) -> None:
 
 def bench(camera: Camera) -> BenchTable:
     """A bench table with three renderings, an estimate, and a calibration without a known error."""
-    cells = [cell(samples=n, seconds=exactly(0.1 * n), mse=exactly(1 / n)) for n in (1, 2, 4)]
-    cells.append(cell("reconstruct", way="frame", samples=None, seconds=exactly(0.01), mse=exactly(0.5)))
+    cells = [cell(samples=n, seconds=0.1 * n, mse=1 / n) for n in (1, 2, 4)]
+    cells.append(cell("reconstruct", way="frame", samples=None, seconds=0.01, mse=0.5))
     cells.append(cell("calibrate", way="points, multijitter", mse=None))
     return bench_table(camera, cells, why="four samples reach the noise floor")
 

@@ -15,7 +15,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from ommatid.bench.convergence import corners
 from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import parse
 from ommatid.scenes.setup import Setup
@@ -27,6 +26,7 @@ from ommatid.simulate.sampling.passes import Rendering, rounding_variance
 from ommatid.simulate.sampling.samplers import fitting
 
 from ..examples import SLOW_SCALAR, THREE, VARIANTS, assert_student, familywise, needs, scene
+from .strata import corners
 
 UNUSUAL = (("2/5", [2, 2], [4, 3]), ("3/10", [1, 2], [2, 3]), (1, [1, 1], [9, 8]))
 CUT = slice(450)  # pixels of three_types whose strata are cut by edges of pixels of f: those of 1/4 are not

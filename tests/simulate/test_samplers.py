@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from ommatid.bench.convergence import corners, law
+from ommatid.bench.slopes import law
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.streams import sampler_seeds
 from ommatid.scenes.camera import Camera
@@ -27,6 +27,7 @@ from ommatid.simulate.sampling.passes import BATCHES, Tally, plan, rounding_vari
 from ommatid.simulate.sampling.samplers import filling, fitting
 
 from ..examples import SLOW_SCALAR, THREE, VARIANTS, camera, familywise, needs, scene
+from .strata import corners
 
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 

@@ -74,7 +74,7 @@ def summary(document: Mapping[str, Any]) -> SweepRow:
         seconds["render"] = document["seconds"]
     numbers: dict[str, Any] = {
         **{name: error.get(name) for name in ("mse", "predicted_mse", "psnr", "ssim", "gain")},
-        **{f"{kind}rms": _root(error.get(f"{kind}mse")) for kind in ("", "predicted_")},
+        **{f"{kind}rms": mse**0.5 for kind in ("", "predicted_") if (mse := error.get(f"{kind}mse")) is not None},
         **{f"expected_{name}": value for name, value in error.get("expected_given_truth", {}).items()},
         **{name: document.get(name) for name in ("rank", "null_space", "condition", "measurements", "unknowns")},
     }
@@ -85,10 +85,6 @@ def summary(document: Mapping[str, Any]) -> SweepRow:
         **{f"budget.{name}": part for name, part in error.get("budget", {}).items()},
         **{f"seconds.{name}": value for name, value in seconds.items() if value is not None},
     )
-
-
-def _root(mse: float | None) -> float | None:
-    return None if mse is None else mse**0.5
 
 
 def write_rows(path: Path, rows: Sequence[SweepRow]) -> None:

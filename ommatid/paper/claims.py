@@ -18,6 +18,7 @@ from ommatid.reconstruct.methods.tile_solver import disjoint_tiles, merge_tiles,
 from ommatid.reconstruct.prediction import observability
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.study import Row
 from ommatid.simulate.ideal import ideal_matrix
 
 from .photographs import WHOLE_BITS, Photograph, Trials
@@ -40,7 +41,7 @@ from .tile_errors import (
 
 YES, NO, QUALIFIED = "yes", "no", "with qualifications"
 PAPER, OWN = "paper", "ommatid"  # sources of claims
-CLAIMS, CLAIM_COLUMNS = "claims.csv", ("claim", "source", "figure", "holds", "numbers", "remark")
+CLAIMS = "claims.csv"
 SAME = 1.1  # ratio of curves that cannot be distinguished on axes of eight decades
 ABOUT_TEN = (8.0, 12.5)  # "about 10 times"
 ORDER_OF_TEN = 3.0  # the least ratio of the order of magnitude of ten
@@ -65,10 +66,11 @@ class Claim:
     figure: str = ""
 
     @property
-    def row(self) -> tuple[str, ...]:
-        """The claim as a row of claims.csv, whose columns are CLAIM_COLUMNS."""
+    def row(self) -> Row:
+        """The claim as a row of claims.csv."""
         numbers = "; ".join(f"{name}: {number:.9g}" for name, number in self.numbers.items())
-        return self.claim, self.source, self.figure, self.holds, numbers, self.remark
+        names = {"claim": self.claim, "source": self.source, "figure": self.figure, "holds": self.holds}
+        return {**names, "numbers": numbers, "remark": self.remark}
 
 
 def shown_in(figure: str, claims: Iterable[Claim]) -> list[Claim]:

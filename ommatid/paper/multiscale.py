@@ -20,12 +20,13 @@ import numpy as np
 from ommatid.analysis.best_camera import design_space, scene_of
 from ommatid.analysis.design import LensCandidate
 from ommatid.runtime.arrays import FloatArray
-from ommatid.runtime.files import make_folder, write_csv
+from ommatid.runtime.files import make_folder
 from ommatid.runtime.progress import Progress
+from ommatid.runtime.study import write_rows
 from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.tables.gallery import GALLERY
 
-from .claims import CLAIM_COLUMNS, CLAIMS, YES, Claim
+from .claims import CLAIMS, YES, Claim
 
 SOURCE = "multiscale paper"
 FLAT = 1e12  # prior variance, which nothing is learnt from
@@ -56,7 +57,7 @@ def write_multiscale(folder: Path, progress: Progress) -> dict[str, Any]:
         progress(number / (len(SQUARES) + len(LINES)))
     hidden = is_deficient((2, 3)) and not any(is_deficient(sizes) for sizes in SQUARES)
     claims.append(Claim("two sizes leave a null space in two dimensions", YES if hidden else "no", {}, source=SOURCE))
-    write_csv(folder / CLAIMS, CLAIM_COLUMNS, (claim.row for claim in claims))
+    write_rows(folder / CLAIMS, [claim.row for claim in claims])
     described = [{"claim": each.claim, "holds": each.holds, "numbers": each.numbers} for each in claims]
     return {"folder": str(folder), "files": [CLAIMS], "claims": described, "seconds": perf_counter() - started}
 

@@ -16,6 +16,7 @@ import numpy as np
 from ommatid.runtime.arrays import FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose, derived_seed
+from ommatid.runtime.study import Row
 from ommatid.scenes import scene
 from ommatid.scenes.formats import picture
 from ommatid.scenes.tables.gallery import GALLERY
@@ -41,6 +42,15 @@ class TileCrops:
     images: FloatArray
     corners: tuple[tuple[int, int], ...]
 
+    @property
+    def columns(self) -> list[str]:
+        """Names of the tiles as columns of tables."""
+        return [f"tile_{row}_{column}" for row, column in self.corners]
+
+    def named(self, errors: FloatArray) -> Row:
+        """Return the errors of the tiles, (T,), by these names."""
+        return dict(zip(self.columns, map(float, errors), strict=True))
+
 
 @dataclass(frozen=True)
 class Trials:
@@ -62,6 +72,15 @@ class Trials:
     def mean(self) -> FloatArray:
         """Measured error averaged over the images: (Q,)."""
         return self.measured.mean(axis=1)
+
+    def rows(self, crops: TileCrops) -> list[Row]:
+        """Return a row per level: bits, None for noise, and the variance that the estimator expects."""
+        return [
+            {"bits": noise.bits, "noise_variance": noise.variance + noise.quantisation_variance}
+            | {"predicted": float(self.predicted[level]), "mean": float(self.mean[level])}
+            | crops.named(self.measured[level])
+            for level, noise in enumerate(self.noises)
+        ]
 
 
 @dataclass(frozen=True)

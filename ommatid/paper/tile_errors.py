@@ -19,6 +19,7 @@ from ommatid.reconstruct.measured_error import TRIM
 from ommatid.reconstruct.prior import independent
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.study import Row
 from ommatid.scenes import scene
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.tables.estimation import PriorTable
@@ -188,12 +189,14 @@ def inner(error: FloatArray, side: int, trim: int = TRIM) -> float:
     return float(error.reshape(side, side)[trim : side - trim, trim : side - trim].mean())
 
 
-def sweep(tile: PaperTile) -> list[tuple[str, float, float, float, float]]:
-    """Return the rows of Fig. 2 and 4: lens types, expected and actual noise variance, mean error, trimmed error."""
-    rows: list[tuple[str, float, float, float, float]] = []
+def sweep(tile: PaperTile) -> list[Row]:
+    """Return the rows of Fig. 2 and 4: expected and actual noise variance, mean error, trimmed error."""
+    rows: list[Row] = []
     for expected in EXPECTED:
         line = tile.line(expected)
         for actual in map(float, ACTUAL):
             error = line.at(actual)
-            rows.append((tile.name, expected, actual, float(error.mean()), inner(error, tile.side)))
+            noise = {"expected_noise_variance": expected, "actual_noise_variance": actual}
+            errors = {"mse": float(error.mean()), "trimmed_mse": inner(error, tile.side)}
+            rows.append(noise | errors)
     return rows

@@ -48,32 +48,27 @@ def _with_misalignment(scene: Scene, name: str) -> Scene:
     return scene.model_copy(update={"estimator": estimator})
 
 
-def study_case(stack: Stack, name: StudyModel, model: Model, truth: FloatArray | None) -> StudyCase:
-    """Reconstruct a stack with one model of H. Raises what `restore` raises."""
-    stack = replace(stack, scene=_with_misalignment(stack.scene, name))
-    restoration = restore(stack, model, truth)
-    given = restoration.interval
-    return StudyCase(
-        model=name,
-        mse=None if restoration.error is None else restoration.error.mse,
-        predicted=restoration.expected.mse,
-        expected=None if given is None else given.mse,
-        low=None if given is None else given.low,
-        high=None if given is None else given.high,
-        seconds=restoration.seconds,
-    )
-
-
 def study_cases(
     stack: Stack,
     models: Mapping[StudyModel, Callable[[], Model]],
     truth: FloatArray | None,
     progress: Progress = no_progress,
 ) -> tuple[StudyCase, ...]:
-    """Return a case for each model, which are made one after the other."""
+    """Reconstruct a stack with each model of H, which are made one after the other. Raises what `restore` raises."""
     cases: list[StudyCase] = []
     for name, model in models.items():
-        cases.append(study_case(stack, name, model(), truth))
+        done = restore(replace(stack, scene=_with_misalignment(stack.scene, name)), model(), truth)
+        given = done.interval
+        case = StudyCase(
+            model=name,
+            mse=None if done.error is None else done.error.mse,
+            predicted=done.expected.mse,
+            expected=None if given is None else given.mse,
+            low=None if given is None else given.low,
+            high=None if given is None else given.high,
+            seconds=done.seconds,
+        )
+        cases.append(case)
         progress(len(cases) / len(models))
     return tuple(cases)
 

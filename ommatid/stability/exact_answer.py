@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.linalg import norm
 
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
@@ -75,6 +76,25 @@ class _Answer:
     image: list[Any]
     variance: list[Any]
     misfit: list[Any]
+
+
+def relative_error(computed: FloatArray, exact: ExactNumbers) -> float:
+    """Return |computed - exact| / |exact| of two vectors; infinite where that is no number."""
+    difference, size = norm(exact.difference(computed), check_finite=False), norm(exact.high)
+    return float(difference / size) if size and np.isfinite(difference) else (float("inf") if difference else 0.0)
+
+
+def worst_relative_error(computed: FloatArray, exact: ExactNumbers, negligible: FloatArray) -> float:
+    """Return the largest |computed - exact| / exact of a set of variances.
+
+    negligible : (N,); a variance of 0 is right if the exact one is smaller than this
+    """
+    if not np.isfinite(computed).all() or (computed < 0).any():
+        return float("inf")
+    error = np.abs(exact.difference(computed))
+    error[((computed == 0) | (exact.high == 0)) & (error <= negligible)] = 0
+    with np.errstate(divide="ignore"):
+        return float(np.divide(error, exact.high, out=np.zeros_like(error), where=error > 0).max(initial=0.0))
 
 
 def exact_answer(problem: Problem, recorded: FloatArray) -> ExactAnswer:

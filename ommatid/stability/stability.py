@@ -11,33 +11,34 @@ errors of all cases with their bounds: points above the dotted line, at ten time
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, astuple, dataclass, fields
+from dataclasses import asdict, dataclass
 from math import log10
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ommatid.figures.curves import Style, draw_curve, draw_level, label
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles, new_figure, own_style
 from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import TOLERANCE, Estimate, estimate
 from ommatid.reconstruct.estimator.residuals import ExactResiduals
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.files import write_csv
 from ommatid.runtime.outputs.occupied import occupied
+from ommatid.runtime.study import Row, write_rows
 
 from .cases import Matrices, StabilityCase, extreme_cases, noise_sweep
-from .exact_answer import ExactAnswer, exact_answer
+from .exact_answer import ExactAnswer, exact_answer, relative_error, worst_relative_error
 
 FLOAT64_DIGITS = 16.0
-QUANTITIES = (
-    ("alone", "estimate before refinement", {"color": "tab:orange", "marker": "v"}),
-    ("refined", "estimate", {"color": "black", "marker": "x", "linewidth": 2.0}),
-    ("variance", "worst posterior variance", {"color": "tab:blue", "marker": "o"}),
+QUANTITIES: tuple[tuple[str, str, Style], ...] = (
+    ("alone", "estimate before refinement", {"color": "tab:orange", "marker": "v", "markersize": 5}),
+    ("refined", "estimate", {"color": "black", "marker": "x", "markersize": 5, "linewidth": 2.0}),
+    ("variance", "worst posterior variance", {"color": "tab:blue", "marker": "o", "markersize": 5}),
 )
-BOUNDS = (
-    ("bound", "bound of the estimate", {"color": "black"}),
-    ("variance_bound", "bound of the variances", {"color": "tab:blue"}),
+BOUNDS: tuple[tuple[str, str, Style], ...] = (
+    ("bound", "bound of the estimate", {"color": "black", "linestyle": "--", "linewidth": 1}),
+    ("variance_bound", "bound of the variances", {"color": "tab:blue", "linestyle": "--", "linewidth": 1}),
 )
 TITLES = {"three": "three types: H has full rank", "two": "two types: H has a null space"}
 LEAST_SHOWN = 1e-17  # errors and bounds below are drawn there
@@ -78,8 +79,8 @@ def write_figure(path: Path, results: Results, files: FigureFiles = SCREEN_PNG) 
     figure = new_figure(14, 5.5, layout="constrained")
     axes = figure.subplots(1, len(TITLES) + 1)
     for panel, (lenses, title) in zip(axes, TITLES.items(), strict=False):
+        label(panel, title, "noise variance (grey levels squared)", "decimal digits lost, of 16", "x")
         _draw_sweep(panel, [(case.noise_variance[0], outcome) for case, outcome in results if case.curve == lenses])
-        panel.set_title(title, fontsize=10)
     _draw_bounds(axes[-1], [outcome for _, outcome in results])
     handles, names = axes[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), fontsize=9)
@@ -89,45 +90,32 @@ def write_figure(path: Path, results: Results, files: FigureFiles = SCREEN_PNG) 
 
 def _draw_sweep(panel: Any, points: list[tuple[float, StabilityOutcome]]) -> None:
     """Draw the digits lost against the noise variance, the bounds as dashed lines; the form that ran stands below."""
-    solved = [(noise, outcome) for noise, outcome in points if outcome.refined is not None]
-    noises = [noise for noise, _ in solved]
-    for field, label, style in QUANTITIES:
-        lost = [FLOAT64_DIGITS - getattr(outcome, field) for _, outcome in solved]
-        panel.plot(noises, lost, label=label, markersize=5, **style)
-    for field, label, style in BOUNDS:
-        stated = [FLOAT64_DIGITS - digits(getattr(outcome, field)) for _, outcome in solved]
-        panel.plot(noises, stated, label=label, linestyle="--", linewidth=1, **style)
+    rows: list[Row] = []
     for noise, outcome in points:
-        words = outcome.form or REFUSED
-        panel.text(noise, -0.4, words, rotation=90, ha="center", va="top", fontsize=7, color="0.4")
-    panel.set_xscale("log")
+        panel.text(noise, -0.4, outcome.form or REFUSED, rotation=90, ha="center", va="top", fontsize=7, color="0.4")
+        if outcome.refined is not None:
+            left = {field: getattr(outcome, field) for field, *_ in QUANTITIES}
+            left |= {field: digits(getattr(outcome, field)) for field, *_ in BOUNDS}
+            rows.append({"noise": noise, **{field: FLOAT64_DIGITS - each for field, each in left.items()}})
+    for field, name, style in (*QUANTITIES, *BOUNDS):
+        draw_curve(panel, rows, "noise", field, label=name, **style)
     panel.set_ylim(-3.8, 12)
     panel.set_yticks(range(0, 13, 2))
-    panel.grid(visible=True, color="0.9")
-    panel.axhline(FLOAT64_DIGITS - DIGITS, color="0.5", linewidth=1, linestyle=":")
-    panel.text(1e-30, FLOAT64_DIGITS - DIGITS + 0.1, "nine digits left", fontsize=8, color="0.4", va="bottom")
-    panel.set_xlabel("noise variance (grey levels squared)")
-    panel.set_ylabel("decimal digits lost, of 16")
+    draw_level(panel, FLOAT64_DIGITS - DIGITS, "nine digits left")
 
 
 def _draw_bounds(panel: Any, outcomes: list[StabilityOutcome]) -> None:
     """Draw the error of every answer against the bound that it states."""
     solved = [outcome for outcome in outcomes if outcome.refined is not None]
-    for (field, label, style), (bound, *_) in zip(QUANTITIES[1:], BOUNDS, strict=True):
+    title = f"{len(solved)} cases solved, {len(outcomes) - len(solved)} refused"
+    label(panel, title, "stated relative bound", "relative error, at least 1e-16", "xy")
+    for (field, name, style), (bound, *_) in zip(QUANTITIES[1:], BOUNDS, strict=True):
         stated = [max(getattr(outcome, bound), LEAST_SHOWN) for outcome in solved]
         errors = [10 ** -getattr(outcome, field) for outcome in solved]
-        marks = {"color": style["color"], "marker": style["marker"], "linestyle": "none", "markersize": 4}
-        panel.plot(stated, errors, label=label, **marks)
+        panel.plot(stated, errors, label=name, **style | {"linestyle": "none", "markersize": 4})
     ends = np.array([LEAST_SHOWN, 1.0])
     panel.plot(ends, ALLOWED_EXCESS * ends, color="0.5", linewidth=1, linestyle=":")
-    panel.set_xscale("log")
-    panel.set_yscale("log")
-    panel.set_xlim(LEAST_SHOWN, 1e-6)
-    panel.set_ylim(LEAST_SHOWN, 1e-6)
-    panel.grid(visible=True, color="0.9")
-    panel.set_title(f"{len(solved)} cases solved, {len(outcomes) - len(solved)} refused", fontsize=10)
-    panel.set_xlabel("stated relative bound")
-    panel.set_ylabel("relative error, at least 1e-16")
+    panel.set(xlim=(LEAST_SHOWN, 1e-6), ylim=(LEAST_SHOWN, 1e-6))
 
 
 def assess(case: StabilityCase, exact: ExactAnswer | None) -> StabilityOutcome:
@@ -149,29 +137,21 @@ def _compare(case: StabilityCase, solution: Estimate, exact: ExactAnswer) -> Sta
     with np.errstate(all="ignore"):
         alone, _ = solution.form.solve(np.zeros((problem.prior.dimension, 1)), residual)
         variance = solution.form.variance()
-    size = float(np.linalg.norm(exact.coefficients.high))
-    alone_error, refined_error = (
-        _relative(float(np.linalg.norm(exact.coefficients.difference(u))), size)
-        for u in (alone[:, 0], solution.coefficients)
-    )
-    right = exact.variance.high
-    wrong = np.abs(exact.variance.difference(variance))
-    wrong[(right == 0) & (wrong <= NEGLIGIBLE_VARIANCE * problem.prior.variance)] = 0.0
-    relative = np.divide(wrong, right, out=np.where(wrong > 0, np.inf, 0.0), where=right > 0)
-    variance_error = float(relative.max(initial=0))
+    alone_error, refined_error = (relative_error(u, exact.coefficients) for u in (alone[:, 0], solution.coefficients))
+    negligible = NEGLIGIBLE_VARIANCE * problem.prior.variance
+    variance_error = worst_relative_error(variance, exact.variance, negligible)
     bounds = (np.inf if solver.bound is None else solver.bound, solver.variance_bound)
     lost = any(
         error > max(ALLOWED_EXCESS * bound, 10**-DIGITS) and bound < NO_STATEMENT
         for error, bound in zip((refined_error, variance_error), bounds, strict=True)
     )
-    invalid = not (np.isfinite(solution.image).all() and np.isfinite(variance).all() and (variance >= 0).all())
     enough = min(digits(refined_error), digits(variance_error)) >= DIGITS
     return StabilityOutcome(
         case.name,
         problem.measurements,
         problem.unknowns,
         solver.method,
-        SILENT if lost or (invalid and max(bounds) < NO_STATEMENT) else RIGHT if enough else FEWER,
+        SILENT if lost or not np.isfinite(solution.image).all() else RIGHT if enough else FEWER,
         digits(alone_error),
         digits(refined_error),
         digits(variance_error),
@@ -184,10 +164,6 @@ def digits(error: float) -> float:
     if not np.isfinite(error):
         return 0.0
     return FLOAT64_DIGITS if error <= 10**-FLOAT64_DIGITS else max(0.0, -log10(error))
-
-
-def _relative(error: float, size: float) -> float:
-    return error / size if size > 0 else (0.0 if error == 0 else float("inf"))
 
 
 def run(matrices: Matrices, progress: Callable[[float], None]) -> Results:
@@ -206,15 +182,14 @@ def write_stability(
     """Write stability.csv and stability.png; return a summary. Raises InputError or MachineError."""
     with occupied(folder):
         results = run(matrices, progress)
-        outcomes = [outcome for _, outcome in results]
-        columns = [field.name for field in fields(StabilityOutcome)]
-        write_csv(folder / "stability.csv", columns, (astuple(outcome) for outcome in outcomes))
+        cases = [asdict(outcome) for _, outcome in results]
+        write_rows(folder / "stability.csv", cases)
         write_figure(folder / "stability.png", results, figures)
-    verdicts = [outcome.verdict for outcome in outcomes]
+    verdicts = [case["verdict"] for case in cases]
     return {
         "files": [str(folder / name) for name in ("stability.csv", "stability.png")],
         "verdicts": {verdict: verdicts.count(verdict) for verdict in (RIGHT, REFUSED, FEWER, SILENT)},
-        "cases": [asdict(outcome) for outcome in outcomes],
+        "cases": cases,
     }
 
 

@@ -18,7 +18,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 from scipy import sparse
-from scipy.linalg import norm
 
 from ommatid.reconstruct.estimator.certificate import NEGLIGIBLE_VARIANCE
 from ommatid.reconstruct.estimator.estimate import estimate
@@ -26,9 +25,8 @@ from ommatid.reconstruct.prior import Prior, exponential
 from ommatid.reconstruct.problem import Problem
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.stability.exact_answer import ExactNumbers, exact_answer
-
-from ..journal import append, entries
+from ommatid.runtime.study import Row, study
+from ommatid.stability.exact_answer import exact_answer, relative_error, worst_relative_error
 
 EACH = 6667  # problems of every family of the whole campaign
 LEAST_ERROR = 1e-9  # an error below it is never silent
@@ -284,36 +282,14 @@ def _stated(error: float, bound: float) -> bool:
     return error <= LEAST_ERROR or error <= ALLOWED_EXCESS * bound
 
 
-def relative_error(computed: FloatArray, exact: ExactNumbers) -> float:
-    """Return |computed - exact| / |exact| of two vectors; infinite where that is no number."""
-    difference, size = norm(exact.difference(computed), check_finite=False), norm(exact.high)
-    return float(difference / size) if size and np.isfinite(difference) else (float("inf") if difference else 0.0)
-
-
-def worst_relative_error(computed: FloatArray, exact: ExactNumbers, negligible: FloatArray) -> float:
-    """Return the largest |computed - exact| / exact of a set of variances.
-
-    negligible : (N,); a variance of 0 is right if the exact one is smaller than this
-    """
-    if not np.isfinite(computed).all() or (computed < 0).any():
-        return float("inf")
-    error = np.abs(exact.difference(computed))
-    error[((computed == 0) | (exact.high == 0)) & (error <= negligible)] = 0
-    with np.errstate(divide="ignore"):
-        return float(np.divide(error, exact.high, out=np.zeros_like(error), where=error > 0).max(initial=0.0))
-
-
-def campaign(seeds: range, families: list[str] | None = None) -> tuple[dict[str, Counter[str]], list[NastyOutcome]]:
-    """Assess every family at every seed; return the counts by family and the silent losses."""
-    counts: dict[str, Counter[str]] = {name: Counter() for name in families or FAMILIES}
-    losses: list[NastyOutcome] = []
-    for name in counts:
-        for seed in seeds:
-            outcome = assess(name, seed)
-            counts[name][outcome.outcome] += 1
-            if outcome.outcome == SILENT:
-                losses.append(outcome)
-    return counts, losses
+def _counted(cell: Row) -> Row:
+    """Assess a family from a seed to another: the numbers of its outcomes, and the silent losses in words."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = [assess(cell["family"], seed) for seed in range(cell["start"], cell["stop"])]
+    lost = [one for one in found if one.outcome == SILENT]
+    words = [f"{one.family}, seed {one.seed}: {one.error:.1e}, stated {one.bound:.1e}" for one in lost]
+    return {"counts": Counter(one.outcome for one in found), "losses": words}
 
 
 def nasty_table(folder: Path, start: int = 0, each: int = EACH) -> Table:
@@ -321,22 +297,14 @@ def nasty_table(folder: Path, start: int = 0, each: int = EACH) -> Table:
 
     Every hundred seeds of a family are one line of `folder`/nasty.jsonl, which are not repeated.
     """
-    begin, path = perf_counter(), folder / "nasty.jsonl"
-    done = {(entry["family"], entry["start"], entry["stop"]): entry for entry in entries(path)}
+    begin = perf_counter()
+    parts = [{"start": first, "stop": min(first + 100, start + each)} for first in range(start, start + each, 100)]
+    cells: list[Row] = [{"family": name, **part} for name in FAMILIES for part in parts]
+    rows = study(folder / "nasty.jsonl", cells, _counted)
     counts: dict[str, Counter[str]] = {name: Counter() for name in FAMILIES}
-    losses: list[str] = []
-    for name in FAMILIES:
-        for first in range(start, start + each, 100):
-            key = name, first, min(first + 100, start + each)
-            if key not in done:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
-                    counted, lost = campaign(range(*key[1:]), [name])
-                words = [f"{one.family}, seed {one.seed}: {one.error:.1e}, stated {one.bound:.1e}" for one in lost]
-                done[key] = {"family": name, "start": key[1], "stop": key[2], "counts": counted[name], "losses": words}
-                append(path, done[key])
-            counts[name] += Counter(done[key]["counts"])
-            losses += done[key]["losses"]
+    for row in rows:
+        counts[row["family"]] += Counter(row["counts"])
+    losses = [loss for row in rows for loss in row["losses"]]
     table = Table(title=f"{each * len(counts)} problems that leave float64 few digits, against exact answers")
     for name in ("family", RIGHT, REFUSED, SILENT):
         table.add_column(name, justify="left" if name == "family" else "right")

@@ -15,8 +15,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Column, Table
 
+from ommatid.runtime.study import append, entries
+
 from ..conftest import TINY, shell
-from ..journal import append, entries
 from .campaign import campaign, command_for
 from .families import FAMILIES, inputs_of
 from .family import SCENE

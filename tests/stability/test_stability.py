@@ -25,6 +25,7 @@ from ommatid.stability.cases import CHANGES, LENSES, StabilityCase, extreme_case
 from ommatid.stability.exact_answer import exact_answer
 from ommatid.stability.stability import DIGITS, FEWER, REFUSED, RIGHT, SILENT, assess
 
+from ..benchmarks.nasty import FAMILIES
 from ..examples import GALLERY
 
 MATRICES = {
@@ -32,27 +33,8 @@ MATRICES = {
 }
 SWEEP = list(noise_sweep(MATRICES))
 EXTREMES = list(extreme_cases(MATRICES))
+INDEPENDENT = ("wide noise", "extreme prior", "whole numbers", "scaled", "hilbert", "large mean")  # priors of families
 ALLOWED = {"solve": {RIGHT}, "solve or refuse": {RIGHT, REFUSED}, "refuse": {REFUSED}}
-
-
-def small_problem(seed: int) -> tuple[Problem, FloatArray]:
-    """A small difficult problem: graded rows and columns, zeros, copies, noise of any size or none."""
-    rng = np.random.default_rng(seed)
-    m, n = rng.integers(1, 7, 2)
-    dense = rng.integers(-3, 4, (m, n)).astype(float) / rng.choice([1.0, 3.0, 7.0])
-    if rng.random() < 0.4:
-        dense *= 10.0 ** rng.integers(-8, 9, (m, 1))
-    if rng.random() < 0.4:
-        dense *= 10.0 ** rng.integers(-4, 5, (1, n))
-    if rng.random() < 0.4:
-        dense[rng.integers(m)] = dense[rng.integers(m)]
-    root = 10.0 ** rng.uniform(-3, 3, n) * (rng.random(n) > 0.15)
-    noise = 10.0 ** rng.uniform(-18, 6, m) if rng.random() < 0.5 else np.full(m, 10.0 ** rng.uniform(-24, 6))
-    noise[rng.random(m) < 0.1] = 0.0
-    prior = Prior(rng.normal(size=n), root)
-    matrix = sparse.csr_array(dense)
-    image = prior.mean + root * rng.normal(size=n)
-    return Problem(matrix, prior, noise), matrix @ image + np.sqrt(noise) * rng.normal(size=m)
 
 
 def graded_problem(seed: int) -> tuple[Problem, FloatArray]:
@@ -117,29 +99,17 @@ def rationals(problem: Problem, g: FloatArray) -> list[list[Fraction]]:
     ]
 
 
-@given(st.integers(0, 10**6))
+@given(st.sampled_from(INDEPENDENT), st.integers(0, 10**6))
 @settings(max_examples=20, deadline=None, derandomize=True)
-def test_the_exact_answer_is_the_rational_one(seed: int) -> None:
-    problem, g = small_problem(seed)
-    answer = exact_answer(problem, g)
+def test_the_exact_answer_is_the_rational_one(family: str, seed: int) -> None:
+    nasty = FAMILIES[family](np.random.default_rng(seed))
+    answer = exact_answer(nasty.problem, nasty.recorded)
     if answer.contradiction > 0:  # the rounding of g without noise: the answer would depend on the order of rows
         return
-    for exact, rational in zip((answer.image, answer.variance), rationals(problem, g), strict=True):
+    for exact, rational in zip((answer.image, answer.variance), rationals(nasty.problem, nasty.recorded), strict=True):
         largest = max(abs(value) for value in rational)
         for high, low, value in zip(exact.high.tolist(), exact.low.tolist(), rational, strict=True):
             assert abs(Fraction(high) + Fraction(low) - value) <= Fraction(1, 10**25) * largest
-
-
-@given(st.integers(0, 10**6))
-@settings(max_examples=50, deadline=None, derandomize=True)
-def test_small_problems_are_right_to_the_tolerance_or_refused(seed: int) -> None:
-    problem, g = small_problem(seed)
-    outcome = assess(case_of(problem, g), exact_answer(problem, g))
-    assert outcome.verdict in (RIGHT, REFUSED, FEWER)
-    if outcome.verdict != REFUSED:
-        assert outcome.refined is not None
-        assert outcome.variance is not None
-        assert min(outcome.refined, outcome.variance) >= 7  # the tolerance of 1e-8, times 10 for sampled variances
 
 
 @pytest.mark.slow

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pytest
@@ -25,20 +26,18 @@ from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.variant import unusable_reason
 
 if TYPE_CHECKING:  # a test asserts that scenes of pinholes load no module of lenses
+    from ommatid.reconstruct.restore import Reconstruction
     from ommatid.simulate.renderer.renderer import Renderer
 
 GALLERY = Path(__file__).parent.parent / "scenes"
 Lenses = tuple[tuple[Any, Any, Any], ...]
 
 VARIANTS = ["scalar_rgb", "llvm_ad_mono"]
-SLOW_SCALAR = [pytest.param("scalar_rgb", marks=pytest.mark.slow), "llvm_ad_mono"]  # the long form of a law
+slow = partial(pytest.param, marks=pytest.mark.slow)  # a case of the long form of a test
+SLOW_SCALAR = [slow("scalar_rgb"), "llvm_ad_mono"]  # the long form of a law
 
 
-def scene(
-    shape: tuple[int, int] = (19, 19),
-    lenses: Lenses = (("1/3", [3, 3], [5, 5]),),
-    **tables: Any,
-) -> Scene:
+def scene(shape: tuple[int, int] = (19, 19), lenses: Lenses = (("1/3", [3, 3], [5, 5]),), **tables: Any) -> Scene:
     """A scene with lens types A, B, ... of (magnification, array, pixels) and more tables by name.
 
     A calibrated H has entries, which most tests are about, unless `calibration` names another fit, and the numbers of
@@ -47,6 +46,7 @@ def scene(
     calibration = {"samples": 256} | tables.get("calibration", {})
     if calibration.get("method") != "ideal":
         calibration = {"fit": "none"} | calibration
+    target = tables.pop("target", {})
     tables = tables | {"render": {"samples": 256} | tables.get("render", {}), "calibration": calibration}
     names = "ABCDEFGH"
     data: dict[str, Any] = {
@@ -56,6 +56,7 @@ def scene(
             "shape": list(shape),
             "pixel_pitch": "1 mm",
             "distance": "1 m",
+            **target,
         },
         "camera": {
             "pixel_pitch": "6 um",
@@ -69,6 +70,12 @@ def scene(
         "prior": {"kind": "independent"} | tables.get("prior", {}),
     }
     return parse(data, Path("test.toml"))
+
+
+def with_keys(described: Scene, **tables: Mapping[str, Any]) -> Scene:
+    """The scene with some keys of its tables changed, which are not validated again."""
+    changed = {name: getattr(described, name).model_copy(update=keys) for name, keys in tables.items()}
+    return described.model_copy(update=changed)
 
 
 THREE = (("1/3", [3, 3], [5, 5]), ("1/5", [5, 5], [3, 3]), ("1/4", [4, 4], [4, 4]))
@@ -126,6 +133,26 @@ OPTICS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # for `with_optics
 }
 
 
+def sets(*changes: str) -> list[str]:
+    """Options of a command that make these changes to its scene."""
+    return [word for change in changes for word in ("--set", change)]
+
+
+Value = TypeVar("Value")
+
+
+def not_none(value: Value | None) -> Value:
+    """The value of something that may be missing, and must not be."""
+    assert value is not None
+    return value
+
+
+def inside_interval(result: Reconstruction) -> bool:
+    """Whether the measured error lies in the 99 % interval that is expected of it."""
+    interval = not_none(result.interval)
+    return interval.low < not_none(result.error).mse < interval.high
+
+
 def needs(variant: str) -> None:
     """Skip the test if a variant does not work on this machine."""
     reason = unusable_reason(variant)
@@ -137,6 +164,28 @@ def posterior_covariance(form: Form, pixels: Sequence[int] = ()) -> NDArray[np.f
     """Columns of the posterior covariance, (N, pixels); all of them, (N, N), if no pixels are named."""
     u, _ = form.pixel_solutions(np.array(pixels or range(form.problem.unknowns), dtype=np.intp))
     return form.problem.prior.apply_root(u)
+
+
+def gain_and_error(
+    h: FloatArray,
+    prior: FloatArray,
+    noise: float | FloatArray,
+    actual_prior: FloatArray | None = None,
+    actual_noise: float | FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """A of Eq. 4, (N, M), and the covariance of the error by Eq. 5, (N, N), with inverses; noise : variances."""
+    expected, actual = (
+        np.diag(np.broadcast_to(noise if each is None else each, len(h))) for each in (noise, actual_noise)
+    )
+    gain = prior @ h.T @ np.linalg.inv(h @ prior @ h.T + expected)
+    hidden = np.eye(len(prior)) - gain @ h
+    missing = hidden @ (prior if actual_prior is None else actual_prior) @ hidden.T
+    return gain, np.asarray(missing + gain @ actual @ gain.T, dtype=np.float64)
+
+
+def covariance_of(prior: Prior) -> FloatArray:
+    """P0 of a prior: (N, N)."""
+    return np.diag(prior.root**2) if prior.independent else prior.root @ prior.root.T
 
 
 def familywise(tests: int, significance: float = 0.01) -> float:

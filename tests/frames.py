@@ -20,7 +20,7 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
-from .examples import Lenses, scene
+from .examples import Lenses, not_none, scene, with_keys
 
 FITTED: Lenses = (("1/3", [3, 3], "fit"), ("1/5", [5, 5], "fit"), ("1/4", [4, 4], "fit"))
 P0 = 5461.25
@@ -28,8 +28,7 @@ P0 = 5461.25
 
 def wide(shape: tuple[int, int], lenses: Lenses = FITTED, **tables: Any) -> Scene:
     """A scene with a lens pitch that leaves room for large sub-images."""
-    described = scene(shape, lenses, **tables)
-    return described.model_copy(update={"camera": described.camera.model_copy(update={"lens_pitch": 50.0})})
+    return with_keys(scene(shape, lenses, **tables), camera={"lens_pitch": 50.0})
 
 
 def frame_camera(shape: tuple[int, int], lenses: Lenses = FITTED) -> Camera:
@@ -40,7 +39,7 @@ def frame_camera(shape: tuple[int, int], lenses: Lenses = FITTED) -> Camera:
 def with_apertures(described: Scene, aperture: float = 1.0) -> Scene:
     """The same scene with thin lenses of an aperture in mm, which diffract."""
     lenses = [lens.model_copy(update={"aperture": aperture}) for lens in described.camera.lens]
-    return described.model_copy(update={"camera": described.camera.model_copy(update={"lens": tuple(lenses)})})
+    return with_keys(described, camera={"lens": tuple(lenses)})
 
 
 def diffracting(shape: tuple[int, int], lenses: Lenses = FITTED, aperture: float = 1.0) -> Camera:
@@ -50,9 +49,26 @@ def diffracting(shape: tuple[int, int], lenses: Lenses = FITTED, aperture: float
 
 def observed(camera: Camera) -> Observation:
     """H as designed, by boxes and kernels."""
-    observation = designed_observation(camera)
-    assert observation is not None
-    return observation
+    return not_none(designed_observation(camera))
+
+
+def assert_acts_as(observation: Observation, matrix: Any, atol: float = 1e-13) -> None:
+    """Forwards, backwards and by its entries an observation is this matrix."""
+    rng = np.random.default_rng(0)
+    image, readings = rng.normal(size=observation.unknowns), rng.normal(size=observation.measurements)
+    np.testing.assert_allclose(observation.forward(image), matrix @ image, atol=atol)
+    np.testing.assert_allclose(observation.adjoint(readings), matrix.T @ readings, atol=atol)
+    assert abs(observation.to_sparse() - matrix).max() < atol
+
+
+def assert_window(observation: Observation, matrix: Any, rows: slice, columns: slice) -> list[int]:
+    """Measurements inside a window have no light beside it, and in it the entries of this matrix; returns them."""
+    inside, part = observation.measurements_inside(rows, columns), np.zeros(observation.shape, dtype=np.bool_)
+    part[rows, columns] = True
+    entries = sparse.csc_array(sparse.csr_array(matrix)[inside])
+    assert abs(observation.submatrix(rows, columns) - entries[:, part.ravel()]).sum() < 1e-9
+    assert abs(entries[:, ~part.ravel()]).sum() < 1e-9
+    return sorted(inside.tolist())
 
 
 def frame_system(
@@ -93,8 +109,7 @@ def assert_methods_agree(described: Callable[[str], Scene], methods: Sequence[st
     """
 
     def estimated(method: str) -> tuple[FloatArray, FloatArray]:
-        chosen = described(method)
-        chosen = chosen.model_copy(update={"prior": chosen.prior.model_copy(update={"level": "known"})})
+        chosen = with_keys(described(method), prior={"level": "known"})
         camera = derive(chosen)
         image = 127.5 + np.random.default_rng(0).normal(0, 70, camera.unknowns)
         done = restore(recorded(chosen, image, 1e-2), ideal_model(chosen, camera), image)

@@ -27,7 +27,7 @@ from ommatid.simulate.renderer.variant import unusable_reason
 from .benchmarks import f_numbers
 from .conftest import Command, shell
 from .documentation import DOCS, PAGES, Block, blocks, page_name, text_of
-from .examples import GALLERY
+from .examples import GALLERY, not_none
 from .printed_figures import check_figures, is_printed, stated_figures, unchecked_decimals
 
 STARTER = str(GALLERY / "starter.toml")
@@ -290,14 +290,12 @@ def test_one_lens_type_against_three() -> None:
 def test_the_first_camera(folder: Path) -> None:
     check_figures("first-camera.md", "`predict --no-rays` computes {}, which is the effect", predicted(STARTER))
     report = ran(folder, STARTER, "render.samples=256", "calibration.samples=256")
-    needed = ran(folder, STARTER).error.mse
-    assert report.error.mse is not None
-    assert needed is not None
+    needed = not_none(ran(folder, STARTER).error.mse)
     rendering = 100 * report.error.budget["rendering"] / report.error.predicted_mse
     check_figures(
         "time.md",
         "has an error of {} instead of {}, and the budget says why: {} % of it is due to the rendering.",
-        *(report.error.mse, needed, rendering),
+        *(not_none(report.error.mse), needed, rendering),
     )
 
 
@@ -307,11 +305,14 @@ def test_the_error_bars_of_the_readme(folder: Path) -> None:
     scene = ommatid.read_scene("photo")
     result = ommatid.run(scene, folder / "photo")
     error = result.summary.error
-    assert error.mse is not None
-    assert error.expected_given_truth is not None
     beyond = np.abs(result.image - ommatid.target_image(scene)) / result.deviation
     shares = [100 * float(np.mean(beyond < limit)) for limit in (1, 2)]
-    check_figures("README.md", "RMS error {}, expected {};", error.mse**0.5, error.expected_given_truth.mse**0.5)
+    check_figures(
+        "README.md",
+        "RMS error {}, expected {};",
+        not_none(error.mse) ** 0.5,
+        not_none(error.expected_given_truth).mse ** 0.5,
+    )
     check_figures(
         "README.md", "{} % of the pixels are off by less than their error bar, {} % by less than two", *shares
     )
@@ -321,10 +322,8 @@ def test_the_error_bars_of_the_readme(folder: Path) -> None:
 @pytest.mark.figures
 @needs_fast_backend
 def test_a_prior_fitted_to_a_noisy_stack(folder: Path) -> None:
-    independent = ran(folder, "tile35", "noise.variance=1").error.mse
-    fitted = ran(folder, "tile35", "noise.variance=1", "prior.kind=fit").error.mse
-    assert independent is not None
-    assert fitted is not None
+    independent = not_none(ran(folder, "tile35", "noise.variance=1").error.mse)
+    fitted = not_none(ran(folder, "tile35", "noise.variance=1", "prior.kind=fit").error.mse)
     check_figures(
         "priors.md",
         "the prior of the paper leaves a mean squared error of {}, and `prior.kind=fit` leaves {}.",
@@ -337,8 +336,7 @@ def test_a_prior_fitted_to_a_noisy_stack(folder: Path) -> None:
 @needs_fast_backend
 def test_two_seeds_of_a_real_sensor(folder: Path) -> None:
     runs = [ran(folder, "sensor", f"render.seed={seed}").error for seed in (0, 1)]
-    expected = runs[0].expected_given_truth
-    assert expected is not None
+    expected = not_none(runs[0].expected_given_truth)
     measured = [float(run.mse or 0) for run in runs]
     check_figures("noise.md", "Two runs with different seeds measured errors of {} and {};", *measured)
     check_figures(

@@ -1,4 +1,4 @@
-"""The best mixture of lens types and its bound, against other ways to the same numbers."""
+"""The best mixture of lens types and its bound, against other ways to the same numbers; candidates for it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ommatid.analysis.best_camera import BestCamera, candidates, design_space, scene_of
-from ommatid.analysis.design import LensCandidate, with_lens
+from ommatid.analysis.design import LensCandidate, magnifications, with_lens
 from ommatid.analysis.mixture import Goal, WaveGroups, best_mixture, best_whole
 from ommatid.analysis.predict import predict_scene
 from ommatid.runtime.arrays import FloatArray
@@ -23,6 +23,7 @@ from ommatid.scenes.tables.gallery import GALLERY
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..conftest import Command
+from ..examples import not_none, scene, sets
 from ..runs import document
 
 PRIOR, NOISE = 5461.25, 1e-2
@@ -90,44 +91,20 @@ def test_the_error_is_that_of_all_boxes_on_a_ring() -> None:
     assert periodic([2, 3], side).information(np.array(counts)) == pytest.approx(bits / side**2 / np.log(4), rel=1e-9)
 
 
-def test_no_mixture_is_below_the_bound() -> None:
-    groups, rng = periodic([2, 3, 4, 5, 6, 7], 24, noise=1.0), np.random.default_rng(1)
-    mixture = best_mixture(groups, 2.5)
-    draws = 2.5 * rng.dirichlet(np.full(6, 0.4), 10_000)
-    least = min(groups.evaluate(draw).error for draw in draws)
-    assert mixture.bound < least
-    assert mixture.found.error <= least
-
-
-@pytest.mark.parametrize("noise", [1e-3, 1.0, 300.0])
-def test_exchanges_find_the_best_of_all_whole_cameras(noise: float) -> None:
-    """Of the 84 sets of three of seven types."""
-    groups = periodic([2, 3, 4, 5, 6, 7, 8], 60, noise)
-    mixture = best_mixture(groups, 3.0)
-    best, *_ = best_whole(groups, 3.0, mixture, 1, anywhere)
-    errors: list[float] = []
-    for chosen in combinations_with_replacement(range(7), 3):
-        errors.append(groups.evaluate(np.bincount(chosen, minlength=7).astype(np.float64)).error)
-    assert best.found.error == pytest.approx(min(errors), rel=1e-12)
-    assert min(errors) >= mixture.bound
-
-
 FIT = tuple(f"camera.lens.{name}.pixels=fit" for name in ("I", "II", "III"))
 CORRELATED = "prior.kind=exponential", "prior.correlation_length=25 mm"
 
 
-def scene(*changes: str) -> Scene:
+def photo(*changes: str) -> Scene:
     return read(GALLERY / "photo.toml", ("target.shape=[119,119]", *changes))
 
 
 def test_the_error_of_the_scene_s_camera_is_the_predicted_one_far_from_the_edges() -> None:
-    described = scene("target.detail=3", "prior.kind=exponential", "prior.correlation_length=25 mm", "noise.variance=1")
+    described = photo("target.detail=3", "prior.kind=exponential", "prior.correlation_length=25 mm", "noise.variance=1")
     best = best_camera(described, [])
-    own = best.space.own
-    assert own is not None
+    own = not_none(best.space.own)
     assert own.counts == (1, 1, 1)
-    trimmed = predict_scene(described, rays=False).trimmed_mse
-    assert trimmed is not None
+    trimmed = not_none(predict_scene(described, rays=False).trimmed_mse)
     assert own.found.error == pytest.approx(trimmed, rel=0.03)
     assert best.mixture.bound <= own.found.error
 
@@ -140,7 +117,7 @@ def test_fill_factors_beat_magnifications_at_low_noise_and_not_at_high() -> None
         changes = *world, "prior.correlation_length=25 mm", f"noise={{variance={noise}}}"
         errors: list[float] = []
         for table in ('fill_factors=[1,"1/3"]', "fill_factors=[1]"):
-            described = scene(*changes, f"design={{{table}}}")
+            described = photo(*changes, f"design={{{table}}}")
             errors.append(best_camera(described, candidates(described, lenses)).whole[0].found.error)
         assert errors[1] / errors[0] == pytest.approx(gain, rel=0.1)
 
@@ -159,33 +136,35 @@ def test_the_command_writes_the_best_cameras(here: Path, ommatid: Command) -> No
     assert "1/3 + 1/4 + 1/5" in lines
 
 
-REFUSED: dict[str, tuple[str, ...]] = {
-    "without noise": ("--set", "noise="),
-    "their own patch": (
-        *("--set", "camera.walls=false", "--set", "calibration={method='transport',fit='none'}"),
-        *(each for name in ("I", "II", "III") for each in ("--set", f"camera.lens.{name}.aperture=0.1 mm")),
-    ),
-    "design.thickness is 0.1 mm": ("--set", "design.thickness=0.1 mm"),
-    "knows noise and prior": ("--set", "estimator.noise_variance=10"),
-    "design.bits are of averages": ("--set", "camera.binning=sum", "--set", "design.bits=[8]"),
-    "both limit the camera": ("--set", "design.readings=3", "--set", "design.sensor_area=1/2.3"),
-    "the smallest array takes 0.0": ("--set", 'design.sensor_area=["0.01 mm", "0.01 mm"]'),
-    "the least is": ("--set", "design.error=1e-9", "--set", 'design.magnifications="1/3,1/4"'),
-    "design.goal is 'information'": ("--set", "design.error=1", "--set", "design.goal=information"),
-    "the smallest array takes": ("--set", "design.readings=0.1"),
-    "at most 200 lens types": (
-        "--set",
-        f"design.fill_factors={[f'1/{n}' for n in range(2, 21)]}".replace("'", '"'),
-        "--set",
-        'design.magnifications="1/2,...,1/20"',
-    ),
-    "design.magnifications: expected a magnification": ("--set", 'design.magnifications="3"'),
+APERTURES = tuple(f"camera.lens.{name}.aperture=0.1 mm" for name in ("I", "II", "III"))
+SOME = 'design.magnifications="1/3,1/4"'
+MANY = [
+    "design.fill_factors=[" + ",".join(f'"1/{n}"' for n in range(2, 21)) + "]",
+    'design.magnifications="1/2,...,1/20"',
+]
+REFUSED: dict[str, list[str]] = {
+    "without noise": ["noise="],
+    "their own patch": ["camera.walls=false", "calibration={method='transport',fit='none'}", *APERTURES],
+    "design.thickness is 0.1 mm": ["design.thickness=0.1 mm"],
+    "knows noise and prior": ["estimator.noise_variance=10"],
+    "design.bits are of averages": ["camera.binning=sum", "design.bits=[8]"],
+    "both limit the camera": ["design.readings=3", "design.sensor_area=1/2.3"],
+    "the smallest array takes 0.0": ['design.sensor_area=["0.01 mm", "0.01 mm"]'],
+    "the least is": ["design.error=1e-9", SOME],
+    "design.goal is 'information'": ["design.error=1", "design.goal=information"],
+    "the smallest array takes": ["design.readings=0.1"],
+    "at most 200 lens types": MANY,
+    "design.magnifications: expected a magnification": ['design.magnifications="3"'],
+    "none fits the sensor": [
+        "noise.variance=1",
+        'design={magnifications="1/3,1/4,1/5",error=50,sensor_area=["0.01 mm","10 mm"]}',
+    ],
 }
 
 
 @pytest.mark.parametrize("words", REFUSED)
 def test_what_has_no_bound_is_refused_in_one_sentence(words: str, here: Path, ommatid: Command) -> None:
-    ended = ommatid("design", "tile19", *REFUSED[words])
+    ended = ommatid("design", "tile19", *sets(*REFUSED[words]))
     assert (ended.code, words in ended.err) == (2, True), ended.err
     assert len(ended.err.splitlines()) == 1
     assert [path.name for path in here.iterdir()] == ["tiny.toml"]
@@ -201,41 +180,39 @@ def test_the_light_of_a_small_dark_target_counts() -> None:
     )
     described = read(GALLERY / "sensor.toml", (*dark, "target.detail=1", "camera.wavelength=none", *FIT))
     best = best_camera(described, [])
-    trimmed = predict_scene(described, rays=False).trimmed_mse
-    assert trimmed is not None
+    trimmed = not_none(predict_scene(described, rays=False).trimmed_mse)
     assert best.mixture.bound <= best.whole[0].found.error <= 1.03 * trimmed
 
 
 def test_candidates_have_the_optics_of_the_last_lens_type() -> None:
     """Of those that are ranked one by one, too."""
-    described = scene("camera.lens.III.fill_factor=1/2")
+    described = photo("camera.lens.III.fill_factor=1/2")
     (candidate,) = candidates(described, [Fraction(1, 6)])
     ranked = with_lens(described, Fraction(1, 6)).camera.lens[-1]
     assert scene_of(described, [candidate]).camera.lens[0].fill_factor == ranked.fill_factor == (0.5, 0.5)
 
 
-def test_types_that_no_camera_can_have_are_named_and_left_out() -> None:
-    described = scene('design={apertures=["0.4 mm","9 mm"]}', "target.shape=[59,59]", "target.detail=3", *CORRELATED)
-    best = best_camera(described, candidates(described, [Fraction(1, 3)]))
-    assert [each.words for each in best.space.types] == ["1/3", "1/3 0.4 mm", "1/4", "1/5"]
-    assert [words for words, _ in best.space.refused.items()] == ["1/3 9 mm"]
+FINER = "target.shape=[59,59]", "target.detail=3", *CORRELATED
+FIFTHS = "camera.lens.I.magnification=3/5", "camera.lens.I.array=[2,2]", "camera.lens_pitch=2 mm"
+LEFT_OUT = {  # changes of the scene, magnifications, what is kept, one of those refused, and the reason
+    "too wide": (('design={apertures=["0.4 mm","9 mm"]}', *FINER), [3], "1/3, 1/3 0.4 mm, 1/4, 1/5", "1/3 9 mm", ""),
+    # Behind pinholes every reading is a sum of whole pixels of f, and behind apertures none is.
+    "detail": (('design={apertures=["0.4 mm"]}',), [3], "1/3, 1/4, 1/5", "1/3 0.4 mm", "detail finer than f"),
+    # Of 3/5 a camera of single pixels on whole pixels of f would be better than any mean over fractions.
+    "fractions": (FIFTHS, [3, Fraction(5, 2)], "1/3", "2/5", "whole m"),
+    # Behind 1/m the sensor stands 6 mm / m from the lenses.
+    "too deep": (('design.thickness="1.3 mm"',), range(3, 8), "1/5, 1/6, 1/7", "1/3", "thickness is 1.3 mm"),
+}
 
 
-def test_types_whose_detail_the_scene_does_not_know_are_left_out() -> None:
-    """Behind pinholes every reading is a sum of whole pixels of f, and behind apertures none is."""
-    described = scene('design={apertures=["0.4 mm"]}')
-    best = best_camera(described, candidates(described, [Fraction(1, 3)]))
-    assert [each.words for each in best.space.types] == ["1/3", "1/4", "1/5"]
-    assert ["detail finer than f" in reason for _, reason in best.space.refused.items()] == [True]
-
-
-def test_ratios_whose_pixels_lie_differently_are_left_out() -> None:
-    """Of 3/5 a camera of single pixels on whole pixels of f would be better than any mean over fractions."""
-    described = scene("camera.lens.I.magnification=3/5", "camera.lens.I.array=[2,2]", "camera.lens_pitch=2 mm")
-    best = best_camera(described, candidates(described, [Fraction(1, 3), Fraction(2, 5)]))
-    assert [each.words for each in best.space.types] == ["1/3"]
-    assert "whole m" in best.space.refused["2/5"]
-    assert best.space.own is None
+@pytest.mark.parametrize("name", LEFT_OUT)
+def test_types_that_no_camera_can_have_are_named_and_left_out(name: str) -> None:
+    changes, wanted, kept, refused, reason = LEFT_OUT[name]
+    described = read(GALLERY / "tile19.toml", changes) if name == "too deep" else photo(*changes)
+    space = best_camera(described, candidates(described, [1 / Fraction(ratio) for ratio in wanted])).space
+    assert ", ".join(each.words for each in space.types) == kept
+    assert reason in space.refused[refused]
+    assert (space.own is None) == (name in ("fractions", "too deep"))
 
 
 def test_cameras_of_no_more_than_the_budget() -> None:
@@ -261,18 +238,21 @@ def test_no_candidate_changes_the_light_of_another() -> None:
     described = read(GALLERY / "sensor.toml", (*near, *FIT, "target.shape=[40,40]"))
     errors: list[float] = []
     for most in (5, 9):
-        own = best_camera(described, candidates(described, [Fraction(1, ratio) for ratio in range(3, most)])).space.own
-        assert own is not None
+        own = not_none(
+            best_camera(described, candidates(described, [Fraction(1, ratio) for ratio in range(3, most)])).space.own
+        )
         errors.append(own.found.error)
     assert errors[0] == pytest.approx(errors[1], rel=1e-9)
 
 
 @pytest.mark.parametrize("size", ['["0.3 mm","1.5 mm"]', '["0.02 mm","0.6 mm"]'])
-def test_small_sensors_have_cameras_or_none(size: str, ommatid: Command) -> None:
-    changes = "--set", "noise.variance=1", "--set", f"design.sensor_area={size}"
-    ended = ommatid("design", "tile19", *changes, "--set", 'design.magnifications="1/3,1/4,1/5"')
+def test_small_sensors_have_cameras_or_none(size: str, here: Path, ommatid: Command) -> None:
+    """A front without a camera is drawn, too."""
+    changes = "noise.variance=1", f"design.sensor_area={size}", 'design.magnifications="1/3,1/4,1/5"'
+    ended, none = ommatid("design", "tile19", *sets(*changes), "-o", "best"), size == '["0.02 mm","0.6 mm"]'
     assert ended.code == 0, ended.err
-    assert ("none fit the sensor" in ended.out) is (size == '["0.02 mm","0.6 mm"]')
+    assert ("none fit the sensor" in ended.out) is none
+    assert ({path.name for path in (here / "best").iterdir()} == {"front.csv", "front.png"}) is none
 
 
 def test_cameras_whose_readings_are_saturated_have_the_error_of_the_prior(ommatid: Command) -> None:
@@ -281,19 +261,6 @@ def test_cameras_whose_readings_are_saturated_have_the_error_of_the_prior(ommati
     assert found["bound"] == found["mixture"]["mse"] == pytest.approx(PRIOR)
     nearly = document(ommatid("design", "sensor", "--set", "sensor.saturation=65", *magnifications))
     assert 0.9 * PRIOR < nearly["bound"] <= nearly["mixture"]["mse"] < PRIOR
-
-
-def test_a_front_without_a_camera_is_drawn(here: Path, ommatid: Command) -> None:
-    changes = "--set", "noise.variance=1", "--set", 'design.sensor_area=["0.02 mm","0.6 mm"]'
-    ended = ommatid("design", "tile19", *changes, "--set", 'design.magnifications="1/3,1/4"', "-o", "none")
-    assert ended.code == 0, ended.err
-    assert {path.name for path in (here / "none").iterdir()} == {"front.csv", "front.png"}
-
-
-def test_a_wish_that_fits_no_sensor_says_so(ommatid: Command) -> None:
-    table = 'design={magnifications="1/3,1/4,1/5",error=50,sensor_area=["0.01 mm","10 mm"]}'
-    ended = ommatid("design", "tile19", "--set", "noise.variance=1", "--set", table)
-    assert (ended.code, "none fits the sensor" in ended.err) == (2, True), ended.err
 
 
 def test_bits_that_miss_a_wish_are_said(ommatid: Command) -> None:
@@ -327,19 +294,21 @@ def test_the_best_of_tiny_cameras_is_that_of_all_sets_of_three(number: int) -> N
     assert best.found.error == pytest.approx(min(errors), rel=1e-9)
 
 
-@pytest.mark.parametrize("goal", ["information", "resolution"])
-def test_other_goals_have_bounds_of_their_own(goal: Goal) -> None:
-    """No draw of mixtures is better than the bound, and exchanges find the best of all sets of three."""
-    groups, rng = replace(periodic([2, 3, 4, 5, 6, 7], 24, noise=1.0), goal=goal), np.random.default_rng(2)
+@pytest.mark.parametrize(
+    ("goal", "noise"), [("information", 1.0), ("resolution", 1.0), *(("error", noise) for noise in (1e-3, 1.0, 300.0))]
+)
+def test_no_mixture_is_better_than_the_bound_and_exchanges_find_the_best(goal: Goal, noise: float) -> None:
+    """Of 10,000 draws of mixtures, and of the 84 sets of three of seven types."""
+    groups, rng = replace(periodic([2, 3, 4, 5, 6, 7, 8], 24, noise), goal=goal), np.random.default_rng(2)
     mixture = best_mixture(groups, 3.0)
     assert mixture.gap <= 1e-4 * abs(mixture.found.value)
-    draws = 3.0 * rng.dirichlet(np.full(6, 0.4), 1000)
-    assert mixture.bound <= min(groups.evaluate(draw).value for draw in draws)
+    least = min(groups.evaluate(draw).value for draw in 3.0 * rng.dirichlet(np.full(7, 0.4), 10_000))
     best, *_ = best_whole(groups, 3.0, mixture, 1, anywhere)
-    values: list[float] = []
-    for chosen in combinations_with_replacement(range(6), 3):
-        values.append(groups.evaluate(np.bincount(chosen, minlength=6).astype(np.float64)).value)
+    sets = (np.bincount(chosen, minlength=7) for chosen in combinations_with_replacement(range(7), 3))
+    values = [groups.evaluate(each.astype(np.float64)).value for each in sets]
     assert best.found.value == pytest.approx(min(values), rel=1e-12)
+    assert mixture.bound <= min(least, *values)
+    assert mixture.found.value <= least
 
 
 def test_information_ranks_otherwise_than_the_error() -> None:
@@ -375,15 +344,6 @@ def test_a_wish_is_met_at_the_least_cost() -> None:
     assert fewer.whole[0].found.error > 0.0072
 
 
-def test_thin_cameras_have_deeper_magnifications_left_out() -> None:
-    """Behind 1/m the sensor stands 6 mm / m from the lenses of the tile."""
-    described = read(GALLERY / "tile19.toml", ('design.thickness="1.3 mm"',))
-    best = best_camera(described, candidates(described, [Fraction(1, ratio) for ratio in range(3, 8)]))
-    assert [each.words for each in best.space.types] == ["1/5", "1/6", "1/7"]
-    assert best.space.own is None
-    assert "design.thickness is 1.3 mm" in best.space.refused["1/3"]
-
-
 def test_whole_cameras_fit_the_sensor() -> None:
     described = read(GALLERY / "tile19.toml", ('design.sensor_area=["0.17 mm", "0.3 mm"]',))
     best = best_camera(described, candidates(described, [Fraction(1, ratio) for ratio in range(3, 8)]))
@@ -416,3 +376,27 @@ def test_tolerances_count_in_the_errors_of_the_cameras(ommatid: Command) -> None
     found = document(ommatid("design", "tile19", *options, "--json"))
     assert found["bound"] == pytest.approx(0.009354, rel=1e-2)
     assert found["cameras"][0]["with_edges"] > 0.02798
+
+
+# --- candidates
+
+
+def test_lists_of_magnifications() -> None:
+    assert magnifications("1/2,1/3,...,1/9") == [Fraction(1, m) for m in range(2, 10)] == magnifications("1/2,...,1/9")
+    assert magnifications("1, 2/5 ,1/4") == [1, Fraction(2, 5), Fraction(1, 4)]
+    assert magnifications("1/2,2/5,...,1/4") == [1 / Fraction(half, 2) for half in range(4, 9)]
+    assert magnifications("1/3,1/3") == [Fraction(1, 3)]
+
+
+@pytest.mark.parametrize("text", ["", "3", "0", "x", "1/0", "...,1/9", "1/2,1/3,...", "1/2,1/4,...,1/9"])
+def test_malformed_lists_of_magnifications_are_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"design\.magnifications"):
+        magnifications(text)
+
+
+def test_the_added_type_is_as_large_as_fits() -> None:
+    camera = derive(with_lens(scene(), Fraction(1, 4)))
+    assert [lens_type.name for lens_type in camera.types] == ["A", "added"]
+    assert (camera.types[1].array, camera.types[1].pixels) == ((4, 4), (4, 4))
+    twice = with_lens(with_lens(scene(), Fraction(1, 4)), Fraction(1, 5))
+    assert [lens.name for lens in twice.camera.lens] == ["A", "added", "added-2"]

@@ -20,7 +20,7 @@ from ommatid.reconstruct.output.verdict_words import limit
 from ommatid.scenes.recording import expected_recording
 from ommatid.scenes.scene import Scene, parse
 
-from ..examples import THREE, Lenses, scene
+from ..examples import THREE, Lenses, not_none, scene
 from ..page.runs import record
 
 IMAGE = np.add.outer(np.linspace(60, 180, 19), np.linspace(0, 40, 19))
@@ -76,9 +76,8 @@ def exposed(gain: float, bits: int) -> RunReport:
         lens |= {"aperture": "0.1 mm", "focus": "1 m"}
     described = parse(plain, Path("test.toml"))
     stack, model = record(described, IMAGE)
-    assert described.sensor is not None
     response = np.full(stack.values.size, 5.0)
-    recording = expected_recording(described.sensor, stack.camera, response, model.forward(IMAGE))
+    recording = expected_recording(not_none(described.sensor), stack.camera, response, model.forward(IMAGE))
     stack = replace(stack, values=recording.values, recording=recording)
     report = reconstruct(stack, model, IMAGE.ravel(), (Path("stack"), Path("model")))[1]
     return report.with_changes(verdict=VerdictReport(trusted=True, reasons=()))
@@ -100,10 +99,8 @@ def test_another_lens_type_brings_what_the_prediction_says() -> None:
     lenses: Lenses = (("1/3", [3, 3], "fit"), ("1/4", [4, 4], "fit"))
     described = scene((19, 19), lenses, noise={"variance": 1.0}, prior={"level": "known"})
     (stack, model), report = record(described, IMAGE), report_of(described)
-    window = error_window(stack, model, IMAGE, report)
-    assert window is not None
-    other = best_other_type(described, window)
-    assert other is not None
+    window = not_none(error_window(stack, model, IMAGE, report))
+    other = not_none(best_other_type(described, window))
     tried = [Fraction(1, 2), Fraction(1, 5)]  # those with the finest pixels that the camera does not have
     after = {ratio: predict_scene(with_lens(described, ratio), rays=False) for ratio in tried}
     assert other.magnification == min(tried, key=lambda ratio: after[ratio].mse)
@@ -117,8 +114,7 @@ def test_another_lens_type_brings_what_the_prediction_says() -> None:
 def test_a_camera_without_a_closed_form_is_not_compared_with_other_types() -> None:
     described, report = run_of(variance=1.0)
     stack, model = record(described, IMAGE)
-    window = error_window(stack, model, IMAGE, report)
-    assert window is not None
+    window = not_none(error_window(stack, model, IMAGE, report))
     plain = described.plain()
     plain["camera"]["lens"][0] |= {"aperture": "0.4 mm", "focus": "600 mm"}
     assert best_other_type(parse(plain, described.source), window) is None

@@ -15,7 +15,7 @@ from ommatid.reconstruct.output.result_files import reconstruct
 from ommatid.reconstruct.prior import exponential
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..examples import Lenses, scene
+from ..examples import Lenses, covariance_of, gain_and_error, not_none, scene
 from ..page.runs import record
 
 PRIOR = 100.0  # variance
@@ -28,9 +28,7 @@ def window_of(shape: tuple[int, int], lenses: Lenses, noise: float, **tables: An
     image = np.full(shape, 127.5)
     stack, model = record(described, image)
     report = reconstruct(stack, model, None, (Path("stack"), Path("model")))[1]
-    window = error_window(replace(stack, values=model.forward(image)), model, image, report)
-    assert window is not None
-    return window
+    return not_none(error_window(replace(stack, values=model.forward(image)), model, image, report))
 
 
 def test_pixels_seen_one_by_one_have_the_response_of_a_wiener_filter() -> None:
@@ -70,8 +68,7 @@ def test_a_sensor_pixel_has_the_response_of_its_box() -> None:
     described = scene((16, 16), (("1/4", [2, 2], [3, 3]),), noise={"variance": 1.0})
     stack, model = record(described, np.zeros((16, 16)))
     window = window_of((16, 16), (("1/4", [2, 2], [3, 3]),), 1.0)
-    shown = of_sub_image(model, window, stack.camera.sub_imagers[0].name)
-    assert shown is not None
+    shown = not_none(of_sub_image(model, window, stack.camera.sub_imagers[0].name))
     frequencies = shown.frequencies[1:]
     box = np.abs(np.sin(4 * np.pi * frequencies) / (4 * np.sin(np.pi * frequencies)))
     np.testing.assert_allclose(shown.horizontal[1:], box, atol=1e-12)
@@ -83,12 +80,10 @@ def test_kernels_and_covariance_are_those_of_the_dense_equations() -> None:
     prior = {"kind": "exponential", "mean": 127.5, "variance": PRIOR, "correlation_length": "3 mm"}
     window = window_of((12, 12), lenses, 2.0, prior=prior)
     matrix = ideal_matrix(record(scene((12, 12), lenses), np.zeros((12, 12)))[0].camera).toarray()
-    root = exponential(0.0, PRIOR, (12, 12), 3.0).root
-    before = root @ root.T
-    gain = before @ matrix.T @ np.linalg.inv(matrix @ before @ matrix.T + 2.0 * np.eye(len(matrix)))
+    gain, covariance = gain_and_error(matrix, covariance_of(exponential(0.0, PRIOR, (12, 12), 3.0)), 2.0)
     pixels = np.array([0, 77])
     np.testing.assert_allclose(window.kernels(pixels).reshape(2, -1), (gain @ matrix)[pixels], atol=1e-9)
-    np.testing.assert_allclose(window.covariance, before - gain @ matrix @ before, atol=1e-9)
+    np.testing.assert_allclose(window.covariance, covariance, atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [37, 12])
@@ -104,14 +99,10 @@ def test_the_middle_of_a_frame_is_that_of_its_window(size: int) -> None:
 # --- degrees of freedom
 
 
-def test_mean_squares_of_correlated_errors_vary_as_their_degrees_of_freedom_say() -> None:
-    window = window_of((12, 12), (("1/3", [2, 2], [3, 3]),), 0.01)
-    pixels = np.arange(40)
-    freedom = window.degrees_of_freedom(pixels)
-    root = np.linalg.cholesky(window.covariance + 1e-9 * np.eye(144))
-    errors = (root @ np.random.default_rng(1).normal(size=(144, 4000)))[pixels]
-    squares = np.square(errors).mean(axis=0)
-    measured = 2 * squares.mean() ** 2 / squares.var(ddof=1)
-    # The relative standard error of a variance of n draws of chi-squared by d: sqrt((2 + 12 / d) / n).
-    assert measured == pytest.approx(freedom, rel=4 * np.sqrt((2 + 12 / freedom) / 4000))
-    assert freedom < 39
+def test_degrees_of_freedom_of_the_mean_square_of_correlated_errors() -> None:
+    """Twice its squared mean over its variance: of normal errors of covariance C, (tr C)^2 / tr C^2."""
+    window, pixels = window_of((12, 12), (("1/3", [2, 2], [3, 3]),), 0.01), np.arange(40)
+    covariance = window.covariance[:40, :40]
+    expected = np.trace(covariance) ** 2 / np.square(covariance).sum()
+    assert window.degrees_of_freedom(pixels) == pytest.approx(expected, rel=1e-9)
+    assert expected < 39

@@ -17,6 +17,7 @@ from ommatid.scenes.tables.gallery import GALLERY
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..conftest import Command
+from ..examples import sets
 from ..runs import document
 
 NOISE = 1.0
@@ -112,16 +113,15 @@ REFUSED = {
 
 @pytest.mark.parametrize("words", REFUSED)
 def test_impossible_windows_are_refused_in_one_sentence(words: str, ommatid: Command) -> None:
-    options, sets = REFUSED[words]
-    ended = ommatid("design", "tile19", *options, *(each for change in sets for each in ("--set", change)))
+    options, changes = REFUSED[words]
+    ended = ommatid("design", "tile19", *options, *sets(*changes))
     assert (ended.code, words in ended.err) == (2, True), ended.err
     assert len(ended.err.splitlines()) == 1
 
 
 def test_windows_whose_patches_overlap_are_refused(here: Path, ommatid: Command) -> None:
     changes = 'camera.lens_pitch="0.03 mm"', "camera.lens.I.pixels=[3,3]", "design.windows=10"
-    sets = [each for change in changes for each in ("--set", change)]
-    ended = ommatid("design", "tile19", "--lens", "I", *sets, "--steer", "0,0,2,19", "-o", "next")
+    ended = ommatid("design", "tile19", "--lens", "I", *sets(*changes), "--steer", "0,0,2,19", "-o", "next")
     assert (ended.code, "overlap" in ended.err) == (2, True), ended.err
     assert not (here / "next").exists()
 

@@ -25,10 +25,11 @@ from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import exact_model, ideal_model, true_matrix
 
 from ..conftest import Command
-from ..examples import needs, scene
+from ..examples import needs, not_none, scene
 from ..runs import document
 
 ONE = (("1/2", [3, 3], [8, 8]),)
+FIT = {"misalignment": "fit"}
 SMOOTH = {"kind": "exponential", "correlation_length": "25 mm"}
 
 
@@ -63,13 +64,10 @@ def test_a_misaligned_camera_with_each_estimator() -> None:
     camera = derive(misaligned())
     best = restore(stack, exact_model(stack.scene, camera, true_matrix(camera), "true"), truth)
     errors = {how: one.error.mse for how, one in restorations.items() if one.error is not None}
-    assert best.error is not None
-    assert restorations["trust"].interval is not None
-    assert errors["trust"] > restorations["trust"].interval.high
-    assert restorations["fit"].interval is not None
-    assert errors["fit"] < restorations["fit"].interval.high
+    assert errors["trust"] > not_none(restorations["trust"].interval).high
+    assert errors["fit"] < not_none(restorations["fit"].interval).high
     assert errors["fit"] < 0.5 * errors["trust"]
-    assert errors["fit"] < 1.5 * best.error.mse
+    assert errors["fit"] < 1.5 * not_none(best.error).mse
     fitted = restorations["fit"]
     assert sum(fitted.budget().values()) == pytest.approx(fitted.expected.mse, rel=1e-6)
     assert fitted.budget()["misalignment"] > 0
@@ -80,29 +78,21 @@ def test_a_misaligned_camera_with_each_estimator() -> None:
 def test_the_deviation_of_a_region_includes_misalignment() -> None:
     fitted = restored("fit")
     mean, deviation = fitted.region((4, 4), (6, 6))
-    assert fitted.truth is not None
-    assert abs(mean - fitted.truth.reshape(18, 18)[4:10, 4:10].mean()) < 5 * deviation
-
-
-def test_unsuitable_cameras_are_refused() -> None:
-    plain = scene((18, 18), ONE, estimator={"misalignment": "fit"})
-    with pytest.raises(InputError, match=r"needs to know what may be misaligned, got no \[camera.tolerance\]"):
-        restore(Stack(plain, derive(plain), np.zeros(576), np.ones(576), {}), ideal_model(plain, derive(plain)))
-    large = misaligned("fit", (80, 80))
-    with pytest.raises(InputError, match="serves up to 4000 pixels of f, got 6400"):
-        restore(*recorded(large))
+    assert abs(mean - not_none(fitted.truth).reshape(18, 18)[4:10, 4:10].mean()) < 5 * deviation
 
 
 @pytest.mark.parametrize(
-    ("keys", "message"),
+    ("described", "message"),
     [
-        ({"method": "tiles"}, "takes one dense problem, got estimator.method 'tiles'"),
-        ({"memory": "1 MB"}, "are allowed; raise estimator.memory"),
+        (scene((18, 18), ONE, estimator=FIT), r"needs to know what may be misaligned, got no \[camera.tolerance\]"),
+        (misaligned("fit", (80, 80)), "serves up to 4000 pixels of f, got 6400"),
+        (misaligned(estimator=FIT | {"method": "tiles"}), "takes one dense problem, got estimator.method 'tiles'"),
+        (misaligned(estimator=FIT | {"memory": "1 MB"}), "are allowed; raise estimator.memory"),
     ],
 )
-def test_other_keys_of_the_estimator_are_obeyed(keys: dict[str, Any], message: str) -> None:
+def test_cameras_and_keys_that_a_fit_does_not_serve_are_refused(described: Scene, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        restore(*recorded(misaligned(estimator={"misalignment": "fit", **keys})))
+        restore(*recorded(described))
 
 
 def test_an_impossible_study_is_refused_before_it_starts() -> None:

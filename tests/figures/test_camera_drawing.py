@@ -16,9 +16,10 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.geometry.optical_terms import ThroughFocus
 from ommatid.scenes.scene import read
 
+from ..examples import slow
 from ..modules import ROOT
 
-CASES = ("tile19", "sensor", *(pytest.param(name, marks=pytest.mark.slow) for name in ("single", "corridor")))
+CASES = ("tile19", "sensor", *(slow(name) for name in ("single", "corridor")))
 BLACK_TARGET = 4  # line width of the target
 
 

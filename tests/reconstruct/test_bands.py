@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import fft, sparse
 
-from ommatid.reconstruct.frame import windows
 from ommatid.reconstruct.frame.bands import Bands
 from ommatid.reconstruct.frame.readings import Readings
-from ommatid.reconstruct.frame.variance_map import VarianceMap, moments
+from ommatid.reconstruct.frame.variance_map import moments
 from ommatid.reconstruct.prior import exponential_spectrum, reflecting_root
-from ommatid.scenes.observation import Observation, repetition
-from tests.scenes.test_kernels import CAMERA, random_kernels
+from ommatid.scenes.observation import repetition
 
 Array = NDArray[np.float64]
 
@@ -52,6 +47,12 @@ def continued(kernel: Array, odd: bool, detail: int = DETAIL, edges: tuple[int, 
     return np.array(rows)
 
 
+def inverse(spectrum: Array) -> Array:
+    """P0^-1 of a prior with this spectrum: (N, N)."""
+    waves = np.kron(*(fft.dct(np.eye(size), 2, axis=0, norm="ortho") for size in spectrum.shape))
+    return np.asarray(waves.T @ np.diag(1 / spectrum.ravel()) @ waves, dtype=np.float64)
+
+
 @pytest.fixture(scope="module")
 def camera() -> tuple[Bands, Array, list[Array]]:
     """Two lens types, with middles on pixels of f and between them; the inverse precision; and their readings."""
@@ -64,15 +65,14 @@ def camera() -> tuple[Bands, Array, list[Array]]:
         kernels.append((kernel + kernel[:, ::-1]) / 2 / side)
     types = (Readings(kernels[0][None], (-1, 2), SHAPE), Readings(kernels[1][None], (0, 0), SHAPE))
     weights, readings = (2.0, 0.7), [continued(kernels[0], True), continued(kernels[1], False)]
-    waves = np.kron(*(fft.dct(np.eye(size), 2, axis=0, norm="ortho") for size in spectrum.shape))
-    precision = waves.T @ np.diag(1 / spectrum.ravel()) @ waves
+    precision = inverse(spectrum)
     for each, weight in zip(readings, weights, strict=True):
         precision += weight * each.T @ each
     covariance = np.asarray(np.linalg.inv(precision), dtype=np.float64)
     return Bands(SHAPE, DETAIL, spectrum, types, weights), covariance, readings
 
 
-def test_groups_of_waves_invert_the_precision_of_reflected_readings(
+def test_groups_invert_the_precision_of_reflected(
     camera: tuple[Bands, Array, list[Array]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bands, covariance, _ = camera
@@ -83,9 +83,7 @@ def test_groups_of_waves_invert_the_precision_of_reflected_readings(
 
 
 @pytest.mark.parametrize("side", [3, 4])
-def test_even_and_odd_kernels_invert_the_precision_of_their_reflected_readings(
-    side: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_even_and_odd_kernels_invert_the_precision_of_readings(side: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the grid of f, with middles on its pixels and between them."""
     monkeypatch.setattr(Bands, "_edges", {})
     monkeypatch.setattr(Bands, "_corners", [])
@@ -94,8 +92,7 @@ def test_even_and_odd_kernels_invert_the_precision_of_their_reflected_readings(
     upright, turned = kernel + kernel[::-1], kernel - kernel[::-1]
     kernels = np.array([part + sign * part[:, ::-1] for part in (upright, turned) for sign in (1, -1)])
     bands = Bands(SHAPE, 1, spectrum, (Readings(kernels, (0, 0), SHAPE),), (0.7,))
-    waves = np.kron(*(fft.dct(np.eye(size), 2, axis=0, norm="ortho") for size in SHAPE))
-    precision = waves.T @ np.diag(1 / spectrum.ravel()) @ waves
+    precision = inverse(spectrum)
     for part in kernels:
         matrix = continued(part, side % 2 == 1, detail=1)
         precision += 0.7 * matrix.T @ matrix
@@ -121,8 +118,7 @@ def test_variances_between_two_edges(camera: tuple[Bands, Array, list[Array]], a
     bands = camera[0]
     down, across = (repetition(size, DETAIL).T / DETAIL for size in SHAPE)
     pixels = sparse.kron(down, across).toarray()
-    waves = np.kron(*(fft.dct(np.eye(size), 2, axis=0, norm="ortho") for size in bands.spectrum.shape))
-    prior = waves.T @ np.diag(1 / bands.spectrum.ravel()) @ waves
+    prior = inverse(bands.spectrum)
     level, ratios, parts = 1.7, (1.0, 3.0), list[Array]()
     for readings, weight, odd in zip(bands.types, bands.weights, (True, False), strict=True):
         matrix = continued(readings.kernels[0], odd, edges=(axis, readings.first[axis], readings.count[axis]))
@@ -172,33 +168,3 @@ def test_moments_are_products_with_the_covariance() -> None:
     np.testing.assert_allclose(found.readings, matrix @ covariance @ matrix.T, atol=1e-10)
     np.testing.assert_allclose(found.both, average @ covariance @ matrix.T, atol=1e-10)
     np.testing.assert_allclose(found.pixels, np.diagonal(average @ covariance @ average.T), atol=1e-10)
-
-
-def test_a_window_turns_the_map_of_mean_kernels_into_that_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One window as large as the image: the mean of the map is then that of the inverted precision."""
-    monkeypatch.setattr(windows, "SIDE", max(CAMERA.shape))
-    kernels = [random_kernels(0, index=number) for number in range(len(CAMERA.types))]
-    varying, means = (Observation(CAMERA.shape, tuple(parts)) for parts in (kernels, [each.mean for each in kernels]))
-    spectrum = exponential_spectrum(CAMERA.shape, 4.0)
-    root, noise = reflecting_root(spectrum), np.random.default_rng(3).uniform(1, 3, CAMERA.measurements)
-    maps: list[Array] = []
-    for observation in (varying, means):
-        matrix = observation.to_sparse().toarray()
-        posterior = np.linalg.inv(np.linalg.inv(root @ root.T) + matrix.T @ (matrix / noise[:, None]))
-        maps.append(np.diagonal(posterior).astype(np.float64).reshape(CAMERA.shape))
-    task: Any = SimpleNamespace(
-        shape=CAMERA.shape,
-        shape_of_f=CAMERA.shape,
-        finer=1,
-        precision_on=lambda _: 1 / spectrum,
-        prior=SimpleNamespace(kind="exponential"),
-        model=SimpleNamespace(camera=CAMERA, applied=varying, unknowns=CAMERA.unknowns),
-        used=np.ones(CAMERA.measurements, dtype=np.bool_),
-        among_used=lambda numbers: numbers,
-        expected_noise=noise,
-    )
-    found = windows.by_windows(
-        VarianceMap(maps[1], maps[1], maps[1]), task, varying, noise, windows.of_mean_kernels(varying)
-    )
-    assert found.posterior.mean() == pytest.approx(maps[0].mean(), rel=1e-6)
-    assert abs(maps[0].mean() / maps[1].mean() - 1) > 0.05

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from scipy import stats
 from ommatid.analysis.predict import predict_scene
 from ommatid.reconstruct.assumptions import assumptions_for
 from ommatid.reconstruct.frame.frame_method import FrameMethod
+from ommatid.reconstruct.frame.readings import leaves_null_space
 from ommatid.reconstruct.method_choice import METHODS, choose_method
 from ommatid.reconstruct.methods.method import Execution, Prepared
 from ommatid.reconstruct.prior import coloured, reflecting_root, spectrum_of
@@ -26,14 +28,15 @@ from ommatid.scenes.fitted.fitted_matrix import FittedMatrix, views_as_designed
 from ommatid.scenes.fitted.kernel_shapes import KernelShapes
 from ommatid.scenes.fitted.kernels import KernelFootprints
 from ommatid.scenes.model import Model, fitted_model
-from ommatid.scenes.scene import Scene, read, with_tables
+from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.gallery import GALLERY
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 from ommatid.simulate.render import exposed
 
-from ..frames import FITTED, P0, blurred, drawn, observed, recorded, wide, with_apertures
+from ..examples import Lenses, not_none, slow, with_keys
+from ..frames import FITTED, P0, blurred, drawn, frame_camera, observed, recorded, wide, with_apertures
 
 ROOT = Path(__file__).parents[2]
 SHAPE = (52, 47)
@@ -42,6 +45,11 @@ NOISE = {"variance": 1e-2, "bits": 10}
 ROUNDING = (256 / 2**10) ** 2 / 12  # variance of the steps of 10 bits
 VARIANCE = 1e-2 + ROUNDING
 SIMULATIONS = 200
+ONE: Lenses = (("1/3", [3, 3], "fit"),)
+TWO: Lenses = FITTED[:2]
+EVEN: Lenses = (*ONE, ("1/2", [2, 2], "fit"), ("1/4", [4, 4], "fit"))
+ODD: Lenses = (*ONE, ("1/4", [3, 5], "fit"))
+FRACTION: Lenses = (*ONE, ("2/7", [4, 4], "fit"))
 UNFITTED = (("1/3", [2, 3], "fit"),)
 ODD_RATIOS = (("2/7", [4, 4], "fit"), ("3/8", [3, 3], "fit"), ("1/4", [4, 4], "fit"))
 ODD_ARRAYS = (("1/3", [2, 4], "fit"), ("1/5", [5, 3], "fit"), ("1/4", [4, 4], "fit"))
@@ -49,8 +57,8 @@ ODD_ARRAYS = (("1/3", [2, 4], "fit"), ("1/5", [5, 3], "fit"), ("1/4", [4, 4], "f
 
 def restored_by(method: str, stack: Stack, model: Model, truth: FloatArray | None) -> Reconstruction:
     """Reconstruct by a method; the frame to 1e-6 posterior standard deviations."""
-    settings = stack.scene.estimator.model_copy(update={"method": method, "accuracy": 1e-6})
-    return restore(replace(stack, scene=stack.scene.model_copy(update={"estimator": settings})), model, truth)
+    scene = with_keys(stack.scene, estimator={"method": method, "accuracy": 1e-6})
+    return restore(replace(stack, scene=scene), model, truth)
 
 
 def both(stack: Stack, model: Model, truth: FloatArray | None) -> tuple[Reconstruction, Reconstruction]:
@@ -88,10 +96,7 @@ def test_without_a_truth_the_expectation_is_that_of_an_image_like_the_estimate()
 
 @pytest.mark.parametrize(
     ("case", "shape"),
-    [
-        *((case, SMALL) for case in ("exact H", "exact H, other expected noise")),
-        *(pytest.param(case, SHAPE, marks=pytest.mark.slow) for case in CASES),
-    ],
+    [*((case, SMALL) for case in ("exact H", "exact H, other expected noise")), *(slow(case, SHAPE) for case in CASES)],
 )
 def test_it_is_the_dense_estimate_with_the_same_error_bars(case: str, shape: tuple[int, int]) -> None:
     """The variance map has its stated accuracy of 1e-3; much expected noise correlates distant pixels (1e-2).
@@ -108,9 +113,7 @@ def test_it_is_the_dense_estimate_with_the_same_error_bars(case: str, shape: tup
     np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=stated)
     np.testing.assert_allclose(frame.expected.resolved, dense.expected.resolved, atol=2e-3)
     assert frame.solver.variance_bound < stated
-    assert frame.residual is not None
-    assert dense.residual is not None
-    assert frame.residual.chi_squared == pytest.approx(dense.residual.chi_squared, rel=1e-4)
+    assert not_none(frame.residual).chi_squared == pytest.approx(not_none(dense.residual).chi_squared, rel=1e-4)
     assert sum(frame.budget().values()) == pytest.approx(frame.expected.mse)
     assert frame.budget()["null_space"] == pytest.approx(dense.budget()["null_space"], rel=1e-3)
     for name, part in dense.budget().items():
@@ -137,57 +140,24 @@ def test_from_a_solution_for_nearly_the_same_noise_fewer_steps_are_left() -> Non
     assert warm.solution.steps < cold.solution.steps
     assert max(warm.solution.bound, cold.solution.bound) <= task.settings.accuracy
     assert np.abs(warm.image - cold.image).max() < 0.02
-    assert warm.response is not None
-    assert cold.response is not None
-    np.testing.assert_allclose(warm.response, cold.response, atol=1e-3)
+    np.testing.assert_allclose(not_none(warm.response), not_none(cold.response), atol=1e-3)
     assert np.abs(near.image - cold.image).max() > 0.03, "another solution"
-
-
-@pytest.mark.slow
-def test_dead_and_saturated_pixels() -> None:
-    scene, truth = wide(SHAPE, noise={"variance": 1e-2, "saturation": 180.0}), drawn(SHAPE, 2)
-    stack = recorded(scene, truth, 1e-2)
-    values = np.minimum(stack.values, 180.0)
-    values[::97] = np.nan
-    dense, frame = both(replace(stack, values=values), ideal_model(scene, stack.camera), truth)
-    assert frame.usable.dead == dense.usable.dead > 0
-    assert frame.usable.saturated == dense.usable.saturated > 0
-    assert np.abs(difference(frame, dense)).max() < 1e-4
-    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("prior", "shape"),
-    [
-        pytest.param({"kind": "exponential", "correlation_length": "25 mm"}, (35, 35), marks=pytest.mark.slow),
-        ({"kind": "exponential", "correlation_length": "25 mm"}, (24, 21)),
-        ({"kind": "power"}, (24, 21)),
-    ],
-    ids=["exponential, large", "exponential", "power"],
-)
-def test_a_prior_of_correlated_pixels_is_that_of_the_dense_problem(
-    prior: dict[str, Any], shape: tuple[int, int]
-) -> None:
-    scene, truth = wide(shape, noise={"variance": 1.0}, prior=prior | {"variance": 2000.0}), drawn(shape, 3)
-    dense, frame = both(recorded(scene, truth, 1.0), ideal_model(scene, derive(scene)), truth)
-    assert np.abs(difference(frame, dense)).max() < 1e-3
-    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=1e-3)
 
 
 @pytest.mark.parametrize(
     ("lenses", "detail", "shape"),
     [
         (ODD_RATIOS, 1, (30, 29)),
-        pytest.param(ODD_RATIOS, 1, (46, 29), marks=pytest.mark.slow),
-        pytest.param(ODD_ARRAYS, 1, (50, 52), marks=pytest.mark.slow),
-        pytest.param(ODD_RATIOS, 2, (50, 30), marks=pytest.mark.slow),
+        slow(ODD_RATIOS, 1, (46, 29)),
+        slow(ODD_ARRAYS, 1, (50, 52)),
+        slow(ODD_RATIOS, 2, (50, 30)),
     ],
     ids=["few ratios", "ratios", "arrays", "finer world"],
 )
 def test_other_arrays_have_the_error_bars_of_windows(lenses: Any, detail: int, shape: tuple[int, int]) -> None:
     """The estimate and Eq. 5 by the inverse of the readings' covariance, one matrix for the whole image."""
-    scene = wide(shape, lenses, noise={"variance": 1.0}, prior={"kind": "power", "variance": 2000.0, "level": "known"})
-    scene = scene.model_copy(update={"target": scene.target.model_copy(update={"detail": detail})})
+    prior = {"kind": "power", "variance": 2000.0, "level": "known"}
+    scene = wide(shape, lenses, noise={"variance": 1.0}, prior=prior, target={"detail": detail})
     camera = derive(scene)
     fine = camera.world
     spectrum = spectrum_of(scene.prior, fine.shape, camera.target_pitch / detail)
@@ -215,40 +185,84 @@ def test_sums_and_intervals_are_those_of_the_dense_problem_where_error_bars_are_
     truth = 127.5 + 1e-2 / P0**0.5 * (drawn(SMALL, 6) - 127.5)
     stack = recorded(scene, truth, 1e-6)
     model = ideal_model(scene, stack.camera)
-    framed = with_tables(scene, estimator=scene.estimator.model_copy(update={"method": "frame"}))
+    framed = with_keys(scene, estimator={"method": "frame"})
     dense, frame = (restore(replace(stack, scene=each), model, truth) for each in (scene, framed))
     assert frame.solver.method == "frame" != dense.solver.method
     assert dense.expected.mse < 1e-2
     for region in (((3, 4), (1, 1)), ((9, 8), (5, 5)), ((0, 0), SMALL)):
         assert frame.region(*region)[1] == pytest.approx(dense.region(*region)[1], rel=0.01)
-    assert dense.interval is not None
-    assert frame.interval is not None
-    assert frame.interval.variance == pytest.approx(dense.interval.variance, rel=0.35)  # of one random image
+    assert not_none(frame.interval).variance == pytest.approx(
+        not_none(dense.interval).variance, rel=0.35
+    )  # of one random image
 
 
-@pytest.mark.parametrize(("shape", "noise"), [((19, 17), 1.0), pytest.param((33, 31), 1e-2, marks=pytest.mark.slow)])
-def test_lenses_that_diffract(shape: tuple[int, int], noise: float) -> None:
-    """Kernels wider than the frame, by the dense problem: the image, error bars at every pixel, and the interval."""
-    scene, truth = with_apertures(wide(shape, noise=NOISE | {"variance": noise})), drawn(shape, 1)
-    camera = derive(scene)
-    dense, frame = both(recorded(scene, truth, noise + ROUNDING), ideal_model(scene, camera), truth)
-    assert np.abs(difference(frame, dense)).max() < 1e-4
-    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=1e-6)
-    assert dense.interval is not None
-    assert frame.interval is not None
-    assert frame.interval.mse == pytest.approx(dense.interval.mse, rel=1e-3)
-    assert frame.verdict.trusted
+@dataclass(frozen=True)
+class Compared:
+    """A recording whose frame is compared with the dense problem, and relative errors of its bars and interval."""
+
+    scene: Scene
+    noise: float
+    seed: int = 1
+    bars: float = 1e-3
+    interval: float = 1e-3
+    image: float = 1e-4  # in posterior standard deviations
+    dead: int = 0  # every so many sensor pixels
 
 
-@pytest.mark.slow
-def test_error_bars_of_two_types_of_lenses() -> None:
-    """Errors of a null space reach from edge to edge; small frames of two lengths give their variances to 4 % here."""
-    shape = 64, 62
-    scene, truth = with_apertures(wide(shape, FITTED[:2], noise=NOISE)), drawn(shape, 1)
-    dense, frame = both(recorded(scene, truth, VARIANCE), ideal_model(scene, derive(scene)), truth)
-    assert np.abs(difference(frame, dense)).max() < 1e-4
-    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=0.04)
-    assert frame.solver.variance_bound < 0.04
+def correlated(kind: str, shape: tuple[int, int], length: str | None = None) -> Compared:
+    prior = {"kind": kind, "variance": 2000.0} | ({} if length is None else {"correlation_length": length})
+    return Compared(wide(shape, noise={"variance": 1.0}, prior=prior), 1.0, 3, image=1e-3, interval=0.03)
+
+
+def apertures(shape: tuple[int, int], noise: float) -> Compared:
+    """Kernels wider than the frame."""
+    scene = with_apertures(wide(shape, noise=NOISE | {"variance": noise}))
+    return Compared(scene, noise + ROUNDING, bars=1e-6)
+
+
+def null_space(shape: tuple[int, int], lenses: Lenses, dead: int = 0) -> Compared:
+    """Bars are differences of inverses, at a step of 1e-4."""
+    return Compared(wide(shape, lenses, noise={"variance": 1e-2}), 1e-2, 0, bars=2e-4, image=1e-3, dead=dead)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(lambda: correlated("exponential", (24, 21), "25 mm"), id="exponential"),
+        slow(lambda: correlated("exponential", (35, 35), "25 mm"), id="exponential, large"),
+        pytest.param(lambda: correlated("power", (24, 21)), id="power"),
+        pytest.param(lambda: apertures((19, 17), 1.0), id="apertures"),
+        slow(lambda: apertures((33, 31), 1e-2), id="apertures, large"),
+        pytest.param(lambda: null_space((24, 31), ONE, 23), id="one type"),
+        pytest.param(lambda: null_space((31, 24), TWO), id="two types"),
+        pytest.param(lambda: null_space((25, 25), ODD, 23), id="other array"),
+        pytest.param(lambda: null_space((27, 25), FRACTION), id="fraction"),
+        slow(
+            # Errors of a null space reach from edge to edge; small frames of two lengths give their variances to 4 %.
+            lambda: Compared(with_apertures(wide((64, 62), TWO, noise=NOISE)), VARIANCE, bars=0.04, interval=0.1),
+            id="two blurred types",
+        ),
+        slow(
+            lambda: Compared(wide(SHAPE, noise={"variance": 1e-2, "saturation": 180.0}), 1e-2, 2, 2e-3, 0.01, dead=97),
+            id="dead and saturated",
+        ),
+    ],
+)
+def test_image_bars_and_interval_are_those_of_the_dense_problem(case: Callable[[], Compared]) -> None:
+    compared = case()
+    scene, truth = compared.scene, drawn(derive(compared.scene).shape, compared.seed)
+    stack, level = recorded(scene, truth, compared.noise), not_none(scene.noise).saturation
+    values = np.minimum(stack.values, np.inf if level is None else level)
+    if compared.dead:
+        values[:: compared.dead] = np.nan
+    dense, frame = both(replace(stack, values=values), ideal_model(scene, stack.camera), truth)
+    assert (frame.usable.dead > 0, frame.usable.saturated > 0) == (compared.dead > 0, level is not None)
+    assert (frame.usable.dead, frame.usable.saturated) == (dense.usable.dead, dense.usable.saturated)
+    assert np.abs(difference(frame, dense)).max() < compared.image
+    np.testing.assert_allclose(frame.expected.variance, dense.expected.variance, rtol=compared.bars)
+    assert frame.solver.variance_bound < compared.bars
+    assert not_none(frame.interval).mse == pytest.approx(not_none(dense.interval).mse, rel=compared.interval)
+    assert frame.verdict.level != "red"
 
 
 def varying_blur(shape: tuple[int, int], noise: float) -> tuple[Scene, Model]:
@@ -273,7 +287,7 @@ def varying_blur(shape: tuple[int, int], noise: float) -> tuple[Scene, Model]:
     return described, fitted_model(described, camera, fitted, None, {"method": "transport", "versions": {}})
 
 
-@pytest.mark.parametrize(("shape", "noise"), [((19, 17), 1.0), pytest.param((33, 31), 1e-2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("shape", "noise"), [((19, 17), 1.0), slow((33, 31), 1e-2)])
 def test_kernels_that_hardly_vary_count_in_error_bars(shape: tuple[int, int], noise: float) -> None:
     """Interval, regions and expected residual of blur that varies by less than 1 %: by the dense covariance.
 
@@ -303,34 +317,25 @@ def test_large_cameras_of_lenses_are_applied_without_entries() -> None:
     assert model.stored is None
     assert camera.is_applied
     assert choose_method(scene, camera, camera.is_applied).method == "frame"
-    tiles = scene.model_copy(update={"estimator": scene.estimator.model_copy(update={"method": "tiles"})})
+    tiles = with_keys(scene, estimator={"method": "tiles"})
     with pytest.raises(InputError, match="blurred lenses have too many for 4189 pixels; set it to 'auto' or 'frame'"):
         choose_method(tiles, camera, camera.is_applied)
     truth = drawn(camera.shape, 2)
     done = restore(recorded(scene, truth, VARIANCE, matrix=ideal_matrix(camera)), model, truth)
     assert done.verdict.trusted
-    assert done.interval is not None
-    assert done.interval.low < float(np.mean((done.estimate - truth) ** 2)) < done.interval.high
+    assert not_none(done.interval).low < float(np.mean((done.estimate - truth) ** 2)) < not_none(done.interval).high
 
 
 @pytest.mark.parametrize(
     ("detail", "shape", "types"),
-    [
-        (1, (25, 23), 3),
-        (2, (25, 23), 3),
-        (2, (25, 23), 1),
-        pytest.param(1, (62, 57), 3, marks=pytest.mark.slow),
-        pytest.param(2, (62, 57), 3, marks=pytest.mark.slow),
-    ],
+    [(1, (25, 23), 3), (2, (25, 23), 3), (2, (25, 23), 1), slow(1, (62, 57), 3), slow(2, (62, 57), 3)],
 )
-def test_the_prediction_of_a_frame_is_that_of_its_reconstruction(
-    detail: int, shape: tuple[int, int], types: int
-) -> None:
+def test_the_prediction_of_a_frame_is_that_of_its_estimate(detail: int, shape: tuple[int, int], types: int) -> None:
     """By transfer functions with edges, against exact maps, solutions and random images: to 2 %."""
     prior = {"kind": "exponential", "variance": 2000.0, "correlation_length": "4 mm"}
-    scene = with_apertures(wide(shape, prior=prior, noise={"variance": 1e-2}))
-    camera = scene.camera.model_copy(update={"lens": scene.camera.lens[:types]})
-    scene = scene.model_copy(update={"target": scene.target.model_copy(update={"detail": detail}), "camera": camera})
+    scene = with_apertures(
+        wide(shape, FITTED[:types], prior=prior, noise={"variance": 1e-2}, target={"detail": detail})
+    )
     setup = Setup.from_scene(scene)
     prediction, truth = predict_scene(scene, rays=False, picture=types == 3), setup.calibrated.image.ravel()
     model = ideal_model(scene, setup.calibrated.camera)
@@ -339,12 +344,12 @@ def test_the_prediction_of_a_frame_is_that_of_its_reconstruction(
     assert prediction.mse == pytest.approx(done.expected.mse, rel=0.02)
     assert prediction.trimmed_mse == pytest.approx(done.trimmed_mse, rel=0.02)
     assert prediction.degrees_of_freedom == pytest.approx(done.expected.degrees_of_freedom, rel=1e-3)
-    assert done.interval is not None
-    assert prediction.budget is not None
     if types == 3:  # one type hides much, and then a picture's error and parts by single draws are their own
-        assert prediction.interval == pytest.approx((done.interval.low, done.interval.high), rel=0.05)
+        assert prediction.interval == pytest.approx(
+            (not_none(done.interval).low, not_none(done.interval).high), rel=0.05
+        )
         for cause in ("null_space", "noise", "detail"):
-            assert prediction.budget[cause] == pytest.approx(done.budget()[cause], rel=0.1)
+            assert not_none(prediction.budget)[cause] == pytest.approx(done.budget()[cause], rel=0.1)
     assert (prediction.rank, prediction.null_space, prediction.condition) == (None, None, None)
 
 
@@ -396,6 +401,9 @@ def test_a_measurement_without_noise_is_refused() -> None:
         ((239, 239), FITTED, {"noise": NOISE, "estimator": {"method": "tiles"}}, "tiles"),
         ((59, 59), FITTED, {"noise": NOISE, "estimator": {"method": "frame"}}, "frame"),
         ((63, 63), FITTED, {"noise": NOISE, "estimator": {"memory": "850 MB"}}, "tiles"),
+        *(((99, 99), lenses, {"noise": NOISE}, "frame") for lenses in (TWO, ODD)),
+        ((499, 499), TWO, {"noise": NOISE}, "tiles"),
+        ((499, 499), FITTED, {"noise": NOISE}, "frame"),
     ],
 )
 def test_which_method_is_chosen(shape: tuple[int, int], lenses: Any, tables: dict[str, Any], method: str) -> None:
@@ -404,6 +412,14 @@ def test_which_method_is_chosen(shape: tuple[int, int], lenses: Any, tables: dic
     assert choice.method == method
     assert choice.method in METHODS
     assert choice.memory <= 850e6 or scene.estimator.memory is None
+
+
+@pytest.mark.parametrize(("lenses", "leaves"), [(ONE, True), (TWO, True), (ODD, True), (EVEN, True), (FITTED, False)])
+def test_a_null_space_of_every_frame(lenses: Lenses, leaves: bool) -> None:
+    """By the rank of H of a small frame."""
+    small = np.linalg.matrix_rank(ideal_matrix(frame_camera((19, 19), lenses)).toarray()) if leaves else 0
+    assert leaves_null_space(frame_camera((59, 59), lenses)) is leaves
+    assert small < 19**2
 
 
 def test_too_little_memory_for_any_method_is_refused() -> None:

@@ -20,7 +20,7 @@ from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ground_truth import cached_truth
 from ommatid.simulate.render import render
 
-from ..examples import needs, scene
+from ..examples import needs, not_none, scene, slow
 
 TRANSPORT = "calibration.method=transport"  # the same H as from points, sooner
 TILE = (
@@ -57,13 +57,11 @@ CROP = (*PERSON, "target.shape=[13, 13]", "calibration.method=ideal", "render.sa
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        *(pytest.param(name, VARIANTS[name], marks=pytest.mark.slow, id=name) for name in gallery_names()),
+        *(slow(name, VARIANTS[name], id=name) for name in gallery_names()),
         *(pytest.param(name, CROP, id=f"{name}, a crop") for name in gallery_names() if name in LARGE),
     ],
 )
-def test_a_scene_of_the_gallery_has_the_verdict_that_it_states(
-    name: str, changes: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_scenes_of_the_gallery_have_their_stated_verdict(name: str, changes: tuple[str, ...], tmp_path: Path) -> None:
     needs("llvm_ad_mono")
     described = read(Path(name), changes)
     camera = derive(described)
@@ -71,8 +69,7 @@ def test_a_scene_of_the_gallery_has_the_verdict_that_it_states(
     truth = load(described) if described.world is None else cached_truth(tmp_path / "truth.exr", setup)
     stack = render(setup)
     verdict = restore(stack, calibrate(setup, stopping_rule=for_stack(stack)), truth.ravel()).verdict
-    assert described.expect is not None
-    assert verdict.trusted == (described.expect == "trusted"), verdict.reasons
+    assert verdict.trusted == (not_none(described.expect) == "trusted"), verdict.reasons
     if described.world is not None:
         assert "before or behind the target's plane" in verdict.reasons[0]
 

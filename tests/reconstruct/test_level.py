@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +10,10 @@ import pytest
 from ommatid.reconstruct.restore import Reconstruction, restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
+from ommatid.scenes.camera import derive
 from ommatid.scenes.scene import Scene
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
-from tests.examples import THREE, Lenses
+from tests.examples import Lenses, gain_and_error, with_keys
 from tests.frames import FITTED, P0, recorded, wide
 
 ONE: Lenses = (("1/3", [3, 3], "fit"),)
@@ -22,7 +22,7 @@ SIDE, NOISE, LEVEL = 23, 1.0, 64.0
 
 def described(lenses: Lenses, method: str, **prior: Any) -> Scene:
     scene = wide((SIDE, SIDE), lenses, noise={"variance": NOISE}, prior={"level": LEVEL} | prior)
-    return scene.model_copy(update={"estimator": scene.estimator.model_copy(update={"method": method})})
+    return with_keys(scene, estimator={"method": method})
 
 
 def dark(seed: int) -> FloatArray:
@@ -37,15 +37,9 @@ def restored(scene: Scene, picture: FloatArray, seed: int = 0) -> Reconstruction
 
 def exact(scene: Scene, actual: float, ratio: float = 1.0) -> tuple[FloatArray, FloatArray]:
     """A' of the estimate, (N, M), and the covariance of its error, (N, N), for other noise and c P0."""
-    stack = recorded(scene, dark(0), NOISE)
-    matrix = ideal_matrix(stack.camera).toarray()
-    count = matrix.shape[1]
-    common = LEVEL**2 * np.ones((count, count))
-    prior = P0 * np.eye(count) + common
-    expected = NOISE * np.eye(len(matrix))
-    gain = prior @ matrix.T @ np.linalg.inv(matrix @ prior @ matrix.T + expected)
-    left = np.eye(count) - gain @ matrix
-    return gain, left @ (ratio * P0 * np.eye(count) + common) @ left.T + actual * gain @ gain.T
+    matrix = ideal_matrix(derive(scene)).toarray()
+    pixels, common = P0 * np.eye(SIDE**2), np.full((SIDE**2, SIDE**2), LEVEL**2)
+    return gain_and_error(matrix, pixels + common, NOISE, ratio * pixels + common, actual)
 
 
 @pytest.mark.parametrize("method", ["auto", "frame"])
@@ -75,7 +69,7 @@ def test_the_estimate_is_that_of_a_prior_with_one_covariance_more(lenses: Lenses
 @pytest.mark.parametrize("lenses", [ONE, FITTED])
 def test_noise_and_pixels_other_than_the_estimator_expects(lenses: Lenses, ratio: float) -> None:
     scene = described(lenses, "auto")
-    expecting = replace_tables(
+    expecting = with_keys(
         scene,
         noise={"variance": 9 * NOISE},
         prior={"variance": ratio * P0},
@@ -90,44 +84,7 @@ def test_noise_and_pixels_other_than_the_estimator_expects(lenses: Lenses, ratio
     assert parts == pytest.approx(result.expected.variance.mean(), rel=1e-9)
 
 
-def replace_tables(scene: Scene, **tables: dict[str, Any]) -> Scene:
-    """The scene with some keys of its tables changed."""
-    changed = {name: getattr(scene, name).model_copy(update=keys) for name, keys in tables.items()}
-    return scene.model_copy(update=changed)
-
-
-@pytest.mark.parametrize("pictures", [4, pytest.param(20, marks=pytest.mark.slow)])
-def test_means_of_regions_of_dark_pictures_deviate_by_what_is_stated(pictures: int) -> None:
-    """With a known level the whole is three of its deviations too bright."""
-    found: list[list[float]] = []
-    for level in ("known", LEVEL):
-        scene = described(ONE, "frame", level=level)
-        stack = recorded(scene, dark(2), NOISE)
-        model, ratios = ideal_model(scene, stack.camera), []
-        for seed in range(pictures):
-            picture = dark(seed)
-            result = restore(replace(stack, values=recorded(scene, picture, NOISE, seed).values), model)
-            mean, deviation = result.region((0, 0), (SIDE, SIDE))
-            ratios.append((mean - float(picture.mean())) / deviation)
-        found.append(ratios)
-    known, unknown = (float(np.mean(np.square(ratios))) ** 0.5 for ratios in found)
-    assert known > 3
-    assert unknown < 1.5
-
-
 def test_tiles_refuse_a_level() -> None:
     with pytest.raises(InputError, match=r"takes the level of the image for known, got prior.level 64"):
         wide((SIDE, SIDE), ONE, prior={"level": LEVEL}, estimator={"method": "tiles"})
     wide((SIDE, SIDE), ONE, estimator={"method": "tiles"})
-
-
-def test_a_known_level_is_the_prior_of_the_paper() -> None:
-    scene = described(THREE, "auto", level="known")
-    stack = recorded(scene, dark(0), NOISE)
-    matrix = ideal_matrix(stack.camera).toarray()
-    information = matrix.T @ matrix / NOISE + np.eye(matrix.shape[1]) / P0
-    expected = (
-        127.5 + np.linalg.solve(information, matrix.T @ (stack.values - matrix @ np.full(SIDE**2, 127.5))) / NOISE
-    )
-    result = restore(stack, ideal_model(scene, stack.camera))
-    np.testing.assert_allclose(result.estimate, expected, atol=1e-6)

@@ -17,7 +17,7 @@ from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.camera import derive
 from ommatid.scenes.model import Model
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
-from tests.examples import THREE, Lenses, scene
+from tests.examples import THREE, Lenses, not_none, scene
 
 BATCHES, SPREAD = 8, 0.02
 NOISE = 1e-2
@@ -54,9 +54,7 @@ def _method(model: Model, recorded: FloatArray, noise: FloatArray) -> DenseMetho
 
 
 def _operators(method: DenseMethod) -> PosteriorOperators:
-    operators = method.operators()
-    assert operators is not None
-    return operators
+    return not_none(method.operators())
 
 
 def _attenuation(method: DenseMethod, noise: FloatArray, rng: np.random.Generator) -> Attenuation:

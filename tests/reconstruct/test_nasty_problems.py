@@ -15,6 +15,7 @@ from ommatid.runtime.errors import InputError
 from ommatid.stability.exact_answer import exact_answer
 
 from ..benchmarks.nasty import FAMILIES, SILENT, assess, relative_error
+from ..examples import not_none, slow
 
 REFUSED = -1.0  # in place of an error
 EACH, FEW = 334, 6  # problems of every family: 5,010 of the long form
@@ -22,7 +23,7 @@ EACH, FEW = 334, 6  # problems of every family: 5,010 of the long form
 MOST_REFUSED = {"nearly equal rows, noise-free": 1.0, "contradiction": 0.65, "singular prior": 0.5}
 
 
-@pytest.mark.parametrize("each", [FEW, pytest.param(EACH, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("each", [FEW, slow(EACH)])
 def test_no_random_problem_is_silently_wrong(each: int) -> None:
     """Every one is right to its stated bound, or refused; few families refuse half, within 3 standard errors."""
     for family in FAMILIES:
@@ -49,8 +50,7 @@ def _excess(problem: Problem, recorded: np.ndarray) -> float:
     except InputError:
         return REFUSED
     exact = exact_answer(problem, recorded)
-    bound = solution.solver.bound
-    assert bound is not None
+    bound = not_none(solution.solver.bound)
     return relative_error(solution.coefficients, exact.coefficients) / max(10 * bound, 1e-9)
 
 

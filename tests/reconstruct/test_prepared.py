@@ -23,17 +23,14 @@ from ommatid.scenes.scene import Scene
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix, ideal_model
 
+from ..examples import gain_and_error, not_none, slow, with_keys
 from ..frames import P0, drawn, precision, recorded, wide
 
 SHAPE = (37, 34)
 VARIANCE = 1.0
 NOISE = {"noise": {"variance": VARIANCE}}
 FRAME = {"method": "frame", "accuracy": 0.01}
-METHODS: dict[str, dict[str, Any]] = {
-    "dense": {"method": "auto"},
-    "frame": FRAME,
-    "tiles": {"method": "tiles"},
-}
+METHODS: dict[str, dict[str, Any]] = {"dense": {"method": "auto"}, "frame": FRAME, "tiles": {"method": "tiles"}}
 
 
 def described(shape: tuple[int, int] = SHAPE, **tables: Any) -> tuple[Scene, Model]:
@@ -64,7 +61,7 @@ def assert_same(shared: Reconstruction, alone: Reconstruction) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("known", [False, True], ids=["unknown truth", "known truth"])
-@pytest.mark.parametrize("noise", [VARIANCE, pytest.param(1e-2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("noise", [VARIANCE, slow(1e-2)])
 def test_frames_of_the_same_noise_are_those_of_single_runs(method: str, known: bool, noise: float) -> None:
     scene, model = described((19, 17), estimator=METHODS[method], noise={"variance": noise})
     prepared = Prepared(model)
@@ -104,8 +101,7 @@ def test_similar_noise_takes_the_error_bars_of_the_first_frame_and_its_own_estim
     prepared = Prepared(model)
     bars = restore(first, model, prepared=prepared).expected.variance
     shared, alone = restore(second, model, prepared=prepared), restore(second, model)
-    difference = shared.result.noise_difference
-    assert difference is not None
+    difference = not_none(shared.result.noise_difference)
     assert 0 < difference <= SAME_NOISE
     np.testing.assert_array_equal(shared.expected.variance, bars)
     exact = np.linalg.inv(precision(ideal_matrix(model.camera), 1 / (VARIANCE + second.rendering_variance), 1 / P0))
@@ -128,9 +124,8 @@ def test_other_conditions_compute_the_error_bars_again(change: str) -> None:
     elif change == "dead pixel":
         second = replace(second, values=np.where(np.arange(second.values.size) == 40, np.nan, second.values))
     else:
-        changed = {"noise": ("variance", 2 * VARIANCE), "prior": ("variance", P0 / 4)}[change]
-        table = getattr(scene, change).model_copy(update=dict([changed]))
-        second = replace(second, scene=scene.model_copy(update={change: table}))
+        variance = {"noise": 2 * VARIANCE, "prior": P0 / 4}[change]
+        second = replace(second, scene=with_keys(scene, **{change: {"variance": variance}}))
     shared, alone = restore(second, model, prepared=prepared), restore(second, model)
     assert shared.result.noise_difference is None
     np.testing.assert_allclose(shared.expected.variance, alone.expected.variance, rtol=1e-3)
@@ -149,9 +144,7 @@ def test_the_difference_of_the_noise_bounds_that_of_the_error(seed: int, scale: 
     assumed = actual if optimal else [rng.uniform(0.1, 10, 7)] * 2
     errors: list[FloatArray] = []
     for noise, expected in zip(actual, assumed, strict=True):
-        gain = prior @ h.T @ np.linalg.inv(h @ prior @ h.T + np.diag(expected))
-        hidden = np.eye(5) - gain @ h
-        errors.append(np.diagonal(hidden @ prior @ hidden.T + gain @ np.diag(noise) @ gain.T))
+        errors.append(np.diagonal(gain_and_error(h, prior, expected, actual_noise=noise)[1]))
     conditions = [
         Conditions((), np.ones(7, np.bool_), expected, {"noise": noise / 3, "rendering": noise * 2 / 3})
         for noise, expected in zip(actual, assumed, strict=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,22 +20,11 @@ from ommatid.reconstruct.prior import (
 )
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.scene import parse
 from ommatid.scenes.tables.estimation import PriorTable
 
-from ..examples import scene
+from ..examples import covariance_of
 
 SHAPE = (5, 7)
-
-
-def covariance(prior: Prior) -> FloatArray:
-    return np.diag(prior.root**2) if prior.independent else prior.root @ prior.root.T
-
-
-def test_independent_pixels() -> None:
-    prior = independent(100.0, 9.0, 35)
-    assert covariance(prior) == pytest.approx(9 * np.eye(35))
-    assert prior.dimension == 35
 
 
 def waves(shape: tuple[int, int]) -> FloatArray:
@@ -56,7 +44,7 @@ def falling(shape: tuple[int, int], length: float) -> FloatArray:
 def test_each_wave_has_the_variance_that_an_exponential_covariance_gives_it(shape: tuple[int, int]) -> None:
     basis = waves(shape)
     expected = np.diagonal(basis.T @ falling(shape, 3.0) @ basis)
-    assert basis.T @ covariance(exponential(0.0, 4.0, shape, 3.0)) @ basis == pytest.approx(np.diag(4 * expected))
+    assert basis.T @ covariance_of(exponential(0.0, 4.0, shape, 3.0)) @ basis == pytest.approx(np.diag(4 * expected))
 
 
 def test_far_from_the_edges_the_covariance_is_exponential() -> None:
@@ -64,7 +52,7 @@ def test_far_from_the_edges_the_covariance_is_exponential() -> None:
 
     def worst(side: int) -> float:
         prior, middle = exponential(0.0, 1.0, (side, side), 2.0), side // 2 * (side + 1)
-        around = covariance(prior)[middle].reshape(side, side)[side // 2 :, side // 2 :][:5, :5]
+        around = covariance_of(prior)[middle].reshape(side, side)[side // 2 :, side // 2 :][:5, :5]
         return float(np.abs(around - falling((5, 5), 2.0)[0].reshape(5, 5)).max())
 
     assert worst(20) < 2 * 2.0 / 20
@@ -120,30 +108,16 @@ def test_images_are_drawn_by_the_root_of_the_covariance() -> None:
 def test_the_power_law_prior_has_its_spectrum(exponent: float) -> None:
     table = PriorTable(kind="power", variance=6.0, exponent=exponent)
     spectrum, basis = np.asarray(spectrum_of(table, (6, 8), 1.0)), waves((6, 8))
-    assert basis.T @ covariance(prior_of(table, (6, 8), 1.0)) @ basis == pytest.approx(np.diag(spectrum.ravel()))
+    assert basis.T @ covariance_of(prior_of(table, (6, 8), 1.0)) @ basis == pytest.approx(np.diag(spectrum.ravel()))
     assert spectrum[3, 4] / spectrum[1, 0] == pytest.approx((np.hypot(3 / 6, 4 / 8) / (1 / 6)) ** -exponent)
     assert spectrum[0, 0] == spectrum[0, 1] == spectrum.max()
     if exponent == 0:
         assert spectrum == pytest.approx(np.full((6, 8), 6.0))
 
 
-def test_images_drawn_from_the_power_law_prior_have_its_spectrum() -> None:
-    """The slope over one octave is -2, within 0.04 by leakage of the window and 4 standard errors of 0.03."""
-    side, draws = 32, 300
-    prior = prior_of(PriorTable(kind="power", variance=1.0, exponent=2.0, mean=0.0), (side, side), 1.0)
-    rng = np.random.default_rng(0)
-    images = prior.apply_root(rng.normal(size=(side**2, draws))).T.reshape(draws, side, side)
-    window = np.outer(np.hanning(side), np.hanning(side))
-    power = np.mean(np.abs(np.fft.fft2(images * window)) ** 2, axis=0)
-    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
-    low, high = ((frequency > f / 1.1) & (frequency < f * 1.1) for f in (0.15, 0.3))
-    slope = np.log(power[high].mean() / power[low].mean()) / np.log(frequency[high].mean() / frequency[low].mean())
-    assert slope == pytest.approx(-2.0, abs=0.16)
-
-
 def test_a_correlation_length_on_the_target_is_converted_to_pixels() -> None:
     table = PriorTable.model_validate({"kind": "exponential", "correlation_length": "6 mm", "variance": 1.0})
-    assert covariance(prior_of(table, SHAPE, 2.0)) == pytest.approx(covariance(exponential(0, 1.0, SHAPE, 3.0)))
+    assert covariance_of(prior_of(table, SHAPE, 2.0)) == pytest.approx(covariance_of(exponential(0, 1.0, SHAPE, 3.0)))
 
 
 @pytest.mark.parametrize("prior", [independent(0.0, 2.0, 35), exponential(0.0, 2.0, SHAPE, 2.0)])
@@ -152,23 +126,6 @@ def test_the_root_and_its_transpose_pass_the_dot_test(prior: Prior) -> None:
     u, f = rng.normal(size=prior.dimension), rng.normal(size=35)
     assert f @ prior.apply_root(u) == pytest.approx(prior.apply_root_transposed(f) @ u)
     assert prior.variance.mean() == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        ({"kind": "exponential"}, "needs a correlation_length"),
-        ({"correlation_length": "1 mm"}, "belongs to kind"),
-        ({"kind": "exponential", "correlation_length": 3.0}, "bare number"),
-        ({"kind": "exponential", "correlation_length": "1 mm", "exponent": 2.0}, "exponent belongs"),
-        ({"variance": 0.0}, "above 0"),
-        ({"kind": "gaussian"}, "'independent', 'exponential', 'power' or 'fit'"),
-    ],
-)
-def test_invalid_prior_tables_are_refused(table: dict[str, object], message: str) -> None:
-    data = scene().plain() | {"prior": table}
-    with pytest.raises(InputError, match=message):
-        parse(data, Path("a.toml"))
 
 
 def test_a_fitted_prior_needs_a_stack() -> None:

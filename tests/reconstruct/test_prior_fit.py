@@ -25,7 +25,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import PriorTable
 from ommatid.simulate.ideal import ideal_model
 
-from ..examples import Lenses
+from ..examples import Lenses, not_none, slow, with_keys
 from ..frames import FITTED, recorded, wide, with_apertures
 
 SHAPE = (19, 19)
@@ -103,7 +103,7 @@ def test_the_evidence_is_the_density_of_the_measurements(count: int) -> None:
     [
         (2.0, 10.0, 1.0),
         *(
-            pytest.param(exponent, length, noise, marks=pytest.mark.slow)
+            slow(exponent, length, noise)
             for exponent, length in ((0.0, 4.0), (1.0, 4.0), (2.5, 6.0), (4.0, 6.0))
             for noise in (1e-6, 1.0, 100.0)
         ),
@@ -122,24 +122,18 @@ def test_drawn_numbers_are_fitted(exponent: float, length: float, noise: float) 
         assert abs(np.log(found / actual)) < 4 * deviation + step
 
 
-def errors(prior: PriorTable, noise: float, seeds: int, kind: str) -> FloatArray:
-    """The squared error over Eq. 5 of images drawn from a prior, estimated with one of a kind: (seeds,)."""
-    described = wide(SHAPE, noise={"variance": noise}, prior={"kind": kind})
-    ratios: list[float] = []
-    for seed in range(seeds):
-        image = drawn(prior, 50 + seed)
-        result = restore(recorded(described, image, noise, seed), MODEL, image)
-        ratios.append(float(np.mean(np.square(result.estimate - image))) / result.expected.mse)
-    return np.array(ratios)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [1.0, 100.0])
 @pytest.mark.parametrize(("exponent", "length"), [(0.0, 4.0), (1.0, 4.0), (2.0, 10.0), (3.0, 10.0), (2.5, 6.0)])
 def test_coverage_with_a_fitted_prior(exponent: float, length: float, noise: float) -> None:
     """Of 20 images of other numbers than the grid's, too, the error is that of Eq. 5 within a tenth, and chance."""
-    ratios = errors(natural(exponent, length, 900.0), noise, 20, "fit")
-    assert ratios.mean() == pytest.approx(1, abs=0.1 + 3 * ratios.std(ddof=1) / 20**0.5)
+    described, prior = wide(SHAPE, noise={"variance": noise}, prior={"kind": "fit"}), natural(exponent, length, 900.0)
+    ratios: list[float] = []
+    for seed in range(20):
+        image = drawn(prior, 50 + seed)
+        result = restore(recorded(described, image, noise, seed), MODEL, image)
+        ratios.append(not_none(result.error).mse / result.expected.mse)
+    assert np.mean(ratios) == pytest.approx(1, abs=0.1 + 3 * float(np.std(ratios, ddof=1)) / 20**0.5)
 
 
 def test_a_level_hardly_changes_the_fit() -> None:
@@ -150,7 +144,7 @@ def test_a_level_hardly_changes_the_fit() -> None:
         assert abs(np.log(there.numbers[name][0] / value)) < 0.1 * max(deviation, 0.1)
 
 
-@pytest.mark.parametrize("noise", [2.0, pytest.param(1e-6, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("noise", [2.0, slow(1e-6)])
 def test_noise_is_fitted_with_a_known_prior(noise: float) -> None:
     """With the prior that the images are drawn from."""
     for prior in (PriorTable(variance=100.0, mean=0.0), PriorTable(kind="power", variance=100.0, mean=0.0)):
@@ -167,8 +161,7 @@ def test_noise_is_fitted_beside_noise_that_is_known() -> None:
     image, more = drawn(natural(2.0, 4.0, 400.0), 6), np.random.default_rng(7).normal(size=706)
     exact = task(image, 3.0, 8, known=known)
     fit = fit_prior(replace(exact, recorded=exact.recorded + np.sqrt(known) * more), noise_known=False)
-    assert fit.noise_variance is not None
-    assert abs(np.log(fit.noise_variance / 3.0)) < 0.3
+    assert abs(np.log(not_none(fit.noise_variance) / 3.0)) < 0.3
     assert not fit.doubtful
 
 
@@ -205,7 +198,7 @@ def test_large_footprints_take_the_whole_image() -> None:
     assert fit_prior(recording, prior_known=True, noise_known=False).measurements == 64
 
 
-@pytest.mark.parametrize("shape", [(67, 65), pytest.param((239, 239), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("shape", [(67, 65), slow((239, 239))])
 def test_a_prior_is_fitted_to_large_images_behind_kernels(shape: tuple[int, int]) -> None:
     """Windows hold few whole kernels."""
     described = with_apertures(wide(shape, noise={"variance": 1e-2}, prior={"kind": "fit"}))
@@ -213,13 +206,12 @@ def test_a_prior_is_fitted_to_large_images_behind_kernels(shape: tuple[int, int]
     model = ideal_model(described, layout)
     stack = recorded(described, drawn(prior, 3, shape), 1e-2, matrix=model.as_linear_operator())
     assumed = assumptions_for(stack, model, choose_method(described, layout, exact=True), Execution())
-    assert assumed.fit is not None
-    value, deviation = exponent_of(assumed.fit)
+    value, deviation = exponent_of(not_none(assumed.fit))
     assert abs(value - 2.0) < 4 * deviation + 0.5
-    assert not assumed.fit.doubtful
+    assert not not_none(assumed.fit).doubtful
 
 
-@pytest.mark.parametrize("length", [25.0, pytest.param(10.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("length", [25.0, slow(10.0)])
 def test_light_from_beside_a_window_hides_no_detail(length: float) -> None:
     """Tails of the point spread reach far beyond a window; as independent noise they would hide weak, fine detail.
 
@@ -229,8 +221,7 @@ def test_light_from_beside_a_window_hides_no_detail(length: float) -> None:
     described = with_apertures(wide(shape, noise={"variance": 1e-2}, prior={"kind": "fit"}), 0.4)
     model, image = ideal_model(described, derive(described)), drawn(natural(3.0, length, 20_000.0), 3, shape)
     result = restore(recorded(described, image, 1e-2, matrix=model.as_linear_operator()), model, image)
-    assert result.error is not None
-    assert 0.85 < result.error.mse / result.expected.mse < 1.2
+    assert 0.85 < not_none(result.error).mse / result.expected.mse < 1.2
 
 
 def test_a_fitted_prior_is_that_of_every_grid() -> None:
@@ -253,7 +244,7 @@ def test_few_correlated_pixels_behind_dead_ones_are_a_dense_problem() -> None:
     assert result.verdict.level == "green"
 
 
-@pytest.mark.parametrize("crops", [4, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("crops", [4, slow(12)])
 def test_error_bars_hold_the_detail_that_noise_hides(crops: int) -> None:
     """Crops of a photograph that much noise hides are hardly more wrong than stated, and a note says so."""
     described = wide(SHAPE, noise={"variance": 1000.0}, prior={"kind": "fit"})
@@ -291,11 +282,7 @@ def test_detail_that_the_lens_averages_out_is_doubtful(contrast: float) -> None:
 
 @pytest.mark.parametrize(
     ("shape", "horizon", "seeds", "blurred"),
-    [
-        ((60, 47), 20, 1, False),
-        pytest.param((119, 119), 71, 20, False, marks=pytest.mark.slow),
-        pytest.param((119, 119), 71, 1, True, marks=pytest.mark.slow),
-    ],
+    [((60, 47), 20, 1, False), slow((119, 119), 71, 20, False), slow((119, 119), 71, 1, True)],
 )
 def test_means_beside_a_horizon_that_no_window_shows(
     shape: tuple[int, int], horizon: int, seeds: int, blurred: bool, monkeypatch: pytest.MonkeyPatch
@@ -333,7 +320,7 @@ def test_a_horizon_in_the_scenes_picture_is_part_of_its_prior() -> None:
     assert with_horizon.variance > 1000 > 20 > without.variance
 
 
-@pytest.mark.parametrize("images", [1, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("images", [1, slow(6)])
 def test_error_bars_of_stars_are_doubtful(images: int) -> None:
     """Bright points are a draw of no Gaussian prior: their errors exceed their bars. Images of a prior do not."""
     described = wide(SHAPE, FITTED[:1], noise={"variance": 1.0}, prior={"kind": "fit"})
@@ -355,8 +342,7 @@ def test_a_prediction_fits_the_prior_to_the_picture(picture: bool, said: str) ->
     """Its error is that of the stack's own fit within a third; without a picture it says what it takes."""
     described = wide(SHAPE, noise={"variance": 1.0}, prior={"kind": "fit"})
     if not picture:
-        target = described.target.model_copy(update={"image": None, "origin": None})
-        described = described.model_copy(update={"target": target})
+        described = with_keys(described, target={"image": None, "origin": None})
     prediction = predict_scene(described, rays=False)
     assert said in " ".join(prediction.assumes)
     if picture:

@@ -1,7 +1,4 @@
-"""Stacks of real sensors: dead and saturated pixels, no pixels at all; and the priors they are reconstructed with.
-
-Stacks come from the ideal model with known noise, so that nothing has to be rendered.
-"""
+"""Stacks of real sensors: dead, saturated and rounded pixels, or none at all; and priors that are fitted to them."""
 
 from __future__ import annotations
 
@@ -11,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import ndimage, stats
 
-from ommatid.reconstruct.noise import censored, usable_pixels
+from ommatid.reconstruct.noise import censored, common_rounding, usable_pixels
 from ommatid.reconstruct.output import facts
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
@@ -29,25 +27,25 @@ from ommatid.simulate.ideal import ideal_model
 from ommatid.simulate.sensors import expose, generators
 
 from ..conftest import Command
-from ..examples import THREE, scene
+from ..examples import THREE, inside_interval, not_none, scene, slow, with_keys
+from ..frames import FITTED, recorded, wide
 from ..runs import document
 
 SENSOR = {"variance": 1.0}
 
 
-def recorded(described: Scene) -> tuple[Stack, Model, FloatArray]:
+def recording(described: Scene) -> tuple[Stack, Model, FloatArray]:
     """The stack that an ideal camera records of the scene's picture with the scene's noise, its H, and the truth."""
     camera, truth = derive(described), load(described).ravel()
     model = ideal_model(described, camera)
-    assert described.noise is not None
-    values = expose(model.forward(truth), described.noise, generators(camera, 3), camera.slices())
+    values = expose(model.forward(truth), not_none(described.noise), generators(camera, 3), camera.slices())
     record = {"seconds": 0.0, "versions": {}, "seed": 3, "first_seed": 3}
     model = replace(model, record={**model.record, "seconds": 0.0, "versions": {}})
     return Stack(described, camera, values, np.zeros_like(values), record), model, truth
 
 
 def restored(described: Scene) -> Reconstruction:
-    return restore(*recorded(described))
+    return restore(*recording(described))
 
 
 def rows(restoration: Reconstruction, stack: Stack, model: Model) -> dict[str, str]:
@@ -56,7 +54,7 @@ def rows(restoration: Reconstruction, stack: Stack, model: Model) -> dict[str, s
 
 def test_dead_pixels_are_left_out_and_counted() -> None:
     """The estimate is that of a camera without these pixels, to the last digit, whatever their values."""
-    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR))
+    stack, model, truth = recording(scene(lenses=THREE, noise=SENSOR))
     dead = np.zeros(stack.values.size, dtype=bool)
     dead[[0, 17, 400]] = True
     broken = replace(stack, values=np.where(dead, np.nan, stack.values))
@@ -65,9 +63,7 @@ def test_dead_pixels_are_left_out_and_counted() -> None:
     whole = restore(stack, model, truth)
     assert restoration.expected.mse > whole.expected.mse
     assert np.isfinite(restoration.estimate).all()
-    assert restoration.error is not None
-    assert restoration.interval is not None
-    assert restoration.interval.low < restoration.error.mse < restoration.interval.high
+    assert inside_interval(restoration)
     assert "3 dead" in rows(restoration, broken, model)["sensor pixels left out"]
     assert "sensor pixels left out" not in rows(whole, stack, model)
 
@@ -76,16 +72,13 @@ def test_dead_pixels_are_left_out_and_counted() -> None:
 def test_saturated_pixels_are_known_to_reach_the_limit(bits: int | None) -> None:
     """Taken for readings, they raise chi-squared of the residual; as censored, the error stays inside its interval."""
     noise = {"variance": 1.0, "saturation": 30.3} | ({} if bits is None else {"bits": bits})
-    stack, model, truth = recorded(scene(lenses=THREE, noise=noise, prior={"level": "known"}))
+    stack, model, truth = recording(scene(lenses=THREE, noise=noise, prior={"level": "known"}))
     assert stack.values.max() == 30.3
     restoration = restore(stack, model, truth)
     assert restoration.usable.saturated > 30
-    assert restoration.error is not None
-    assert restoration.interval is not None
-    assert restoration.error.mse < restoration.interval.high
+    assert not_none(restoration.error).mse < not_none(restoration.interval).high
     without_level = replace(stack, scene=stack.scene.model_copy(update={"noise": NoiseTable(variance=1.0, bits=bits)}))
-    used = restore(without_level, model, truth).residual
-    assert used is not None
+    used = not_none(restore(without_level, model, truth).residual)
     assert restoration.residual is not None
     assert abs(restoration.residual.chi_squared - restoration.residual.expected) < 4 * restoration.residual.deviation
     assert abs(used.chi_squared - used.expected) > 4 * used.deviation
@@ -105,17 +98,14 @@ def test_light_just_below_saturation_is_not_biased(bits: int | None) -> None:
     model = ideal_model(described, camera)
     model = replace(model, record={**model.record, "seconds": 0.0, "versions": {}})
     differences, ratios, inside = np.empty(seeds), np.empty(seeds), 0
-    assert described.noise is not None
     for seed in range(seeds):
         truth = 236 + np.random.default_rng(seed).normal(0, 5, model.unknowns)
-        values = expose(model.forward(truth), described.noise, generators(camera, seed), camera.slices())
+        values = expose(model.forward(truth), not_none(described.noise), generators(camera, seed), camera.slices())
         result = restore(Stack(described, camera, values, np.zeros_like(values), record), model, truth)
         assert result.usable.saturated > 0
-        assert result.error is not None
-        assert result.interval is not None
         differences[seed] = model.forward(result.estimate - truth).mean()
-        ratios[seed] = result.error.mse / result.expected.mse
-        inside += result.interval.low < result.error.mse < result.interval.high
+        ratios[seed] = not_none(result.error).mse / result.expected.mse
+        inside += inside_interval(result)
     for mean, samples in ((0, differences), (1, ratios)):
         assert abs(samples.mean() - mean) < 4 * samples.std(ddof=1) / seeds**0.5
     assert inside >= seeds - 2
@@ -125,7 +115,7 @@ def test_a_saturated_sensor_is_censored_at_the_reading_it_would_have() -> None:
     """The limit in units of f, of a [sensor] and of rounded values: light at the limit saturates half of all pixels."""
     for bits in (None, 5):
         noise = {"variance": 25.0, "saturation": 200.0} | ({} if bits is None else {"bits": bits})
-        stack, model, _ = recorded(scene(lenses=THREE, noise=noise))
+        stack, model, _ = recording(scene(lenses=THREE, noise=noise))
         limit = 200.0 if bits is None else 196.0  # 200 is 25 levels of 8: rounded to from 24.5 on
         usable = usable_pixels(stack, model)
         full = replace(usable, used=np.zeros_like(usable.used), full=np.ones_like(usable.used))
@@ -137,20 +127,15 @@ def test_a_saturated_sensor_is_censored_at_the_reading_it_would_have() -> None:
 
 def test_saturation_survives_the_file(tmp_path: Path) -> None:
     """The stack holds float32: a level that float32 rounds down is still known."""
-    stack, _, _ = recorded(scene(lenses=THREE, noise={"variance": 1.0, "saturation": 30.3}))
+    stack, _, _ = recording(scene(lenses=THREE, noise={"variance": 1.0, "saturation": 30.3}))
     stacks.write(tmp_path / "stack.exr", stack)
     assert usable_pixels(stacks.read(tmp_path / "stack.exr")).saturated == usable_pixels(stack).saturated > 0
 
 
 def test_a_stack_without_usable_pixels_gives_the_prior_and_a_warning() -> None:
-    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR, prior={"mean": 99.0, "variance": 16.0}))
+    stack, model, truth = recording(scene(lenses=THREE, noise=SENSOR, prior={"mean": 99.0, "variance": 16.0}))
     for kind in ("independent", "fit"):
-        prior = stack.scene.prior.model_copy(update={"kind": kind})
-        nothing = replace(
-            stack,
-            values=np.full(706, np.nan),
-            scene=stack.scene.model_copy(update={"prior": prior}),
-        )
+        nothing = replace(stack, values=np.full(706, np.nan), scene=with_keys(stack.scene, prior={"kind": kind}))
         restoration = restore(nothing, model, truth)
         assert restoration.estimate == pytest.approx(np.full(361, 99.0))
         assert restoration.expected.variance == pytest.approx(np.full(361, 16.0 + 64.0**2)), "the level is not known"
@@ -174,33 +159,19 @@ def test_a_fitted_prior_and_noise_from_the_stack_alone() -> None:
     """On a photograph the error falls below a third, the noise is fitted, and both are in the table."""
     paper = restored(scene(lenses=THREE, noise=SENSOR))
     tables: dict[str, Any] = {"prior": {"kind": "fit"}, "estimator": {"noise_variance": "fit"}}
-    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR, **tables))
+    stack, model, truth = recording(scene(lenses=THREE, noise=SENSOR, **tables))
     restoration = restore(stack, model, truth)
-    assert paper.error is not None
-    assert restoration.error is not None
-    assert restoration.error.mse < paper.error.mse / 3
-    assert restoration.fit is not None
-    assert restoration.fit.noise_variance == pytest.approx(1.0, rel=4 * restoration.fit.numbers["noise_variance"][1])
+    assert not_none(restoration.error).mse < not_none(paper.error).mse / 3
+    assert not_none(restoration.fit).noise_variance == pytest.approx(
+        1.0, rel=4 * not_none(restoration.fit).numbers["noise_variance"][1]
+    )
     lines = rows(restoration, stack, model)
     assert {"fitted variance", "fitted correlation length", "fitted noise variance"} <= set(lines)
-    known = restored(scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}))
-    assert known.fit is not None
-    assert known.fit.noise_variance is None
-    noise_alone = restored(scene(lenses=THREE, noise={"variance": 9.0}, estimator={"noise_variance": "fit"}))
-    assert noise_alone.fit is not None
-    assert noise_alone.fit.noise_variance == pytest.approx(9.0, rel=4 * noise_alone.fit.numbers["noise_variance"][1])
-    assert noise_alone.prior.kind == "independent"
 
 
-def test_the_mean_of_a_region() -> None:
-    """Within four standard deviations of the true mean, and far more precise than one pixel."""
-    stack, model, truth = recorded(scene(lenses=THREE, noise=SENSOR))
-    restoration = restore(stack, model, truth)
-    mean, deviation = restoration.region((4, 5), (6, 3))
-    assert abs(mean - truth.reshape(19, 19)[4:10, 5:8].mean()) < 4 * deviation
-    assert deviation < 0.3 * float(np.sqrt(restoration.expected.variance).mean())
+def test_a_region_outside_the_image_is_refused() -> None:
     with pytest.raises(InputError, match="does not lie inside an image of 19 x 19"):
-        restoration.region((18, 0), (2, 1))
+        restored(scene(lenses=THREE, noise=SENSOR)).region((18, 0), (2, 1))
 
 
 def test_a_region_from_the_command_line(kept: Path, ommatid: Command) -> None:
@@ -238,18 +209,18 @@ def test_negative_variances_are_refused(kept: Path, ommatid: Command) -> None:
 def test_without_noise_there_is_no_chi_squared() -> None:
     pixel_by_pixel = (1, [1, 1], [12, 12]), ("1/3", [3, 3], [3, 3])
     noiseless: dict[str, Any] = {"noise": {"variance": 0.0}, "estimator": {"noise_variance": 0.0}}
-    stack, model, truth = recorded(scene((12, 12), pixel_by_pixel, **noiseless))
+    stack, model, truth = recording(scene((12, 12), pixel_by_pixel, **noiseless))
     restoration = restore(stack, model, truth)
     assert restoration.residual is None
     assert "chi-squared of the residual" not in rows(restoration, stack, model)
     assert restoration.estimate == pytest.approx(truth, rel=1e-6)
 
 
-@pytest.mark.parametrize("estimator", [{"noise_variance": "fit"}, pytest.param({}, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("estimator", [{"noise_variance": "fit"}, slow({})])
 def test_a_fit_with_an_uncertain_h(estimator: dict[str, Any]) -> None:
     """The variance due to H is computed at the fitted image: chi-squared is as expected."""
     described = scene(lenses=THREE, noise=SENSOR, prior={"kind": "fit"}, estimator=estimator)
-    stack, model, truth = recorded(described)
+    stack, model, truth = recording(described)
     rng = np.random.default_rng(0)
     spread = 0.002 * rng.normal(size=model.matrix.nnz)
     uncertain = replace(
@@ -262,5 +233,71 @@ def test_a_fit_with_an_uncertain_h(estimator: dict[str, Any]) -> None:
     restoration = restore(stack, uncertain, truth)
     assert restoration.residual is not None
     assert abs(restoration.residual.chi_squared - restoration.residual.expected) < 4 * restoration.residual.deviation
-    assert restoration.fit is not None
-    assert not restoration.fit.doubtful
+    assert not not_none(restoration.fit).doubtful
+
+
+# --- rounded readings
+
+
+VARIANCE, SEEDS = 1e-3, 24  # 0.03 steps of eight bits
+SIGNIFICANCE = 1e-3
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.2, 0.4])
+def test_the_common_variance_is_the_mean_square_of_the_mean_error(noise: float) -> None:
+    """Over lights spread evenly within a step, the expected reading from the normal distribution at every edge."""
+    light = (np.arange(4000) + 0.5) / 4000
+    edges = np.arange(-8, 9) + 0.5
+    above = stats.norm.sf(edges, light[:, None], noise) if noise else (light[:, None] > edges).astype(np.float64)
+    error = above.sum(axis=1) - 8 - light
+    step = 0.25
+    rounding = np.full(4000, step**2 / 12)
+    # Dark frames have the same error in every exposure, which dithers none of them.
+    variances = {"noise": np.full(4000, (noise * step) ** 2), "quantisation": rounding, "frames": rounding}
+    columns = common_rounding(variances, step * light)
+    found = np.square(columns).sum(axis=0)
+    np.testing.assert_allclose(found, step**2 * np.square(error).mean(), rtol=0.05, atol=1e-12)
+    assert columns[0] @ columns[1] == pytest.approx(0, abs=1e-9 + 1e-3 * found.sum())
+
+
+def rounded(kind: str, shape: tuple[int, int], seed: int) -> tuple[Reconstruction, FloatArray]:
+    """The reconstruction of a picture at eight bits, and its truth."""
+    rng = np.random.default_rng(seed)
+    truth = np.full(shape, rng.uniform(20, 220))
+    if kind == "smooth":
+        truth += 6 * ndimage.gaussian_filter(rng.normal(size=shape), 3)
+    if kind == "ramp":
+        truth = 40 + 150 * np.linspace(0, 1, shape[0] * shape[1]).reshape(shape)
+    described = wide(shape, FITTED, noise={"variance": VARIANCE, "bits": 8}, prior={"kind": "fit"})
+    stack = recorded(described, truth.ravel(), VARIANCE, seed)
+    stack = replace(stack, values=np.round(stack.values))
+    return restore(stack, ideal_model(described, derive(described)), truth.ravel()), truth
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape", "seeds"),
+    [
+        ("flat", (13, 13), 3),
+        slow("smooth", (19, 19), SEEDS),
+        slow("ramp", (19, 19), SEEDS),
+        slow("flat", (47, 45), SEEDS),
+    ],
+)
+def test_means_of_smooth_pictures_err_by_what_is_stated(kind: str, shape: tuple[int, int], seeds: int) -> None:
+    """The largest error of a mean is half a step, and what is stated root 12 times less than one: at most 1.7 times."""
+    scores: list[list[float]] = []
+    inside = 0
+    for seed in range(seeds):
+        found, truth = rounded(kind, shape, seed)
+        assert found.verdict.trusted
+        assert any("times the quantisation step" in note for note in found.verdict.notes)
+        inside += float(np.square(found.estimate - truth.ravel()).mean()) <= not_none(found.interval).high
+        regions = ((5, 6), (1, 1)), ((3, 4), (5, 5)), ((0, 0), shape)
+        means = [found.region(*region) for region in regions]
+        true = [truth[r : r + h, c : c + w].mean() for (r, c), (h, w) in regions]
+        scores.append([(mean - value) / deviation for (mean, deviation), value in zip(means, true, strict=True)])
+    assert inside >= stats.binom.ppf(SIGNIFICANCE, seeds, 0.99)
+    squares = np.square(scores).sum(axis=0)
+    assert (squares < stats.chi2.ppf(1 - SIGNIFICANCE, seeds)).all()
+    if kind == "flat":
+        assert (squares > stats.chi2.ppf(SIGNIFICANCE, seeds)).all()

@@ -17,7 +17,7 @@ from ommatid.scenes.scene import parse
 from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_matrix
 
-from ..examples import THREE, scene
+from ..examples import THREE, not_none, scene
 
 SHAPE = (31, 33)
 SLOPE = np.hypot(3.0, 2.0)  # grey levels per pixel of f
@@ -92,9 +92,7 @@ def recorded(noise: dict[str, float]) -> tuple[Stack, FloatArray]:
 
 def test_the_best_is_that_with_the_least_error() -> None:
     stack, truth = recorded({})
-    best = best_single_sub_image(stack, truth.ravel())
-    assert best is not None
-    assert best.psnr is not None
+    best = not_none(best_single_sub_image(stack, truth.ravel()))
     images = zip(stack.camera.sub_imagers, stack.images(), strict=True)
     errors = {
         sub.name: float(np.mean((enlarged(stack.camera, sub, image, np.arange(19.0)) - truth) ** 2))
@@ -103,24 +101,20 @@ def test_the_best_is_that_with_the_least_error() -> None:
     assert best.name == min(errors, key=lambda name: errors[name])
     assert sorted(errors.values())[1] > 1.001 * best.mse
     assert best.mse == pytest.approx(errors[best.name])
-    assert best.psnr == pytest.approx(10 * np.log10(255**2 / np.mean((best.image - truth) ** 2)))
-    noisy = best_single_sub_image(*recorded({"C": 100.0, "B": 100.0}))
-    assert noisy is not None
+    assert not_none(best.psnr) == pytest.approx(10 * np.log10(255**2 / np.mean((best.image - truth) ** 2)))
+    noisy = not_none(best_single_sub_image(*recorded({"C": 100.0, "B": 100.0})))
     assert (best.name[0], noisy.name[0]) == ("C", "A")
 
 
 def test_dead_pixels_take_the_value_of_the_nearest() -> None:
     stack, truth = recorded({})
-    whole = best_single_sub_image(stack, truth)
+    whole = not_none(best_single_sub_image(stack, truth))
     values = stack.values.copy()
     values[7::25] = np.nan
-    dead = best_single_sub_image(replace(stack, values=values), truth)
-    assert whole is not None
-    assert dead is not None
+    dead = not_none(best_single_sub_image(replace(stack, values=values), truth))
     assert np.isfinite(dead.image).all()
     assert whole.mse <= dead.mse < 3 * whole.mse
-    nothing = best_single_sub_image(replace(stack, values=np.full_like(values, np.nan)), truth)
-    assert nothing is not None
+    nothing = not_none(best_single_sub_image(replace(stack, values=np.full_like(values, np.nan)), truth))
     assert nothing.mse == pytest.approx(float(np.mean(truth**2)))
 
 

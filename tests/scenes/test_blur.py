@@ -1,4 +1,4 @@
-"""Blurred footprints of thin lenses against limits, Fourier integrals and integrals along lines."""
+"""Blurred footprints of thin lenses, and diffraction, against limits, closed forms and integrals."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import integrate, special
 
 from ommatid.scenes.camera import Camera
-from ommatid.scenes.constants import AIRY_FIRST_ZERO, GREEN
+from ommatid.scenes.constants import GREEN
 from ommatid.scenes.lens_type import LensOptics
-from ommatid.scenes.optics.diffraction import TAIL
-from ommatid.scenes.optics.field import FINEST, optics_of
+from ommatid.scenes.optics.diffraction import TAIL, Pattern, pattern
+from ommatid.scenes.optics.field import FINEST
 from ommatid.scenes.optics.lens_kernels import blurred_matrix, kernels
 from ommatid.scenes.optics.lens_matrix import matrix, row_by_rays, row_by_waves
 from ommatid.scenes.optics.point_spread import point_spread
@@ -22,6 +23,7 @@ from ommatid.scenes.optics.wavefront import thin_wavefront
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import camera
+from ..printed_figures import check_figures
 
 Numbers = NDArray[np.float64]
 
@@ -31,33 +33,6 @@ DISKS = [LensOptics(aperture=0.4, focus=800.0), LensOptics(aperture=0.4), LensOp
 def with_lens_optics(optics: LensOptics, wavelength: float | None = None, ratio: str = "1/3") -> Camera:
     cam = camera((19, 19), ((ratio, [3, 3], [5, 5]),))
     return replace(cam, types=(replace(cam.types[0], optics=optics),), wavelength=wavelength)
-
-
-# ---- the blur of a camera
-
-
-def test_rays_through_the_rim_of_the_lens_land_on_the_rim_of_the_disk() -> None:
-    """The ray from s through the lens point a meets -s focus / depth in the plane in focus."""
-    cam = with_lens_optics(LensOptics(aperture=0.4, focus=800.0))
-    field, s, depth = optics_of(cam, cam.types[0], None), 0.07, cam.depth(cam.types[0])
-    landed = [a + (-s * 800 / depth - a) * cam.distance / 800 for a in (-0.2, 0.2)]
-    rays = field.wave(s, None)
-    assert rays is not None
-    across = np.ptp(rays.hits[1]) / rays.outermost
-    assert across == pytest.approx(abs(landed[1] - landed[0]), rel=1e-3)
-    # The middle of the light is beside that of the disk: the near side of the lens is brighter.
-    assert rays.centre[1] == pytest.approx(np.mean(landed), abs=1e-2 * across)
-
-
-def test_the_first_dark_ring_is_at_1_22_wavelengths_over_the_aperture() -> None:
-    cam = with_lens_optics(LensOptics(aperture=0.4), wavelength=550e-6)
-    field = optics_of(cam, cam.types[0], 550e-6)
-    spread = point_spread(field.lit_wave(0.0), field.grid)
-    dark = AIRY_FIRST_ZERO * GREEN / 0.4 * 1000
-    near = np.abs(spread.offsets - dark) < 0.5 * dark
-    middle = spread.values[len(spread.values) // 2]
-    assert middle[near].min() < 1e-3 * middle.max()
-    assert spread.offsets[near][np.argmin(middle[near])] == pytest.approx(dark, abs=spread.cell)
 
 
 # ---- limits, sums and symmetries of H
@@ -237,3 +212,91 @@ def test_pixels_off_the_axis_follow_the_cos4_law(focus: float) -> None:
         expected = (axes[0] * weights / weights.sum()) @ axes[1].T
         np.testing.assert_allclose(exact[k, l, i, j], expected, rtol=0, atol=2e-4 * expected.max())
         np.testing.assert_allclose(found[k, l, i, j], expected, rtol=0, atol=1e-3 * expected.max())
+
+
+# --- diffraction of a defocused circular pupil
+
+
+WAVES = [0.0, 0.1, 0.21, 0.5, 1.0, 2.0, 3.0, 20.0]
+FREQUENCIES = [0.1, 0.3, 0.5, 0.7, 0.9]  # of the cut-off
+
+
+def hopkins(q: float, waves: float) -> float:
+    """Transfer function of a defocused circular pupil (H. H. Hopkins, Proc. R. Soc. A 231, 91 (1955), Eq. 16)."""
+    chord, _ = integrate.quad(  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+        lambda x: np.cos(8 * np.pi * waves * q * x) * np.sqrt(1 - (x + q) ** 2), 0, 1 - q, limit=500
+    )
+    return float(4 / np.pi * chord)
+
+
+def modulation(psf: Pattern, q: float) -> float:
+    v = np.linspace(0.0, psf.end, 20001)
+    return float(integrate.simpson(psf.spread(v) * special.j0(2 * q * v), x=v))
+
+
+@pytest.mark.parametrize("waves", [0.0, 0.085, 0.21, 0.33, 0.5, 0.9, 1.0, 2.0])
+def test_the_strehl_ratio_of_defocus_is_its_squared_sinc(waves: float) -> None:
+    v = np.array([1e-4])
+    assert 2 * pattern(waves).spread(v)[0] / v[0] == pytest.approx(np.sinc(waves) ** 2, abs=1e-8)
+
+
+def test_the_strehl_ratio_of_the_documentation() -> None:
+    v = np.array([1e-4])
+    strehl = 2 * pattern(0.21).spread(v)[0] / v[0]
+    check_figures("diffraction.md", "with 0.21 waves of defocus, the Strehl ratio is {};", strehl)
+
+
+@pytest.mark.parametrize("waves", WAVES)
+def test_modulation_at_five_frequencies_is_hopkins(waves: float) -> None:
+    for q in FREQUENCIES:
+        assert modulation(pattern(waves), q) == pytest.approx(hopkins(q, waves), abs=1e-3)
+
+
+def test_the_pattern_in_focus_is_airy_s() -> None:
+    psf = pattern(0.0)
+    v = np.linspace(0.1, psf.end, 1000)
+    np.testing.assert_allclose(psf.spread(v), 2 * special.j1(v) ** 2 / v, atol=1e-6)
+    np.testing.assert_allclose(psf.within(v), 1 - special.j0(v) ** 2 - special.j1(v) ** 2, atol=1e-6)
+    assert psf.encircled == pytest.approx(1 - TAIL, abs=3e-5)
+
+
+@pytest.mark.parametrize("waves", WAVES)
+def test_encircled_energy_follows_from_the_transfer_function(waves: float) -> None:
+    """The share within v is 2 v times the integral of the transfer function and J1(2 q v) over q (Parseval)."""
+    psf = pattern(waves)
+    x, w = np.polynomial.legendre.leggauss(400)
+    q = np.sin(np.pi / 4 * (1 + x)) ** 2
+    weights = np.pi / 4 * w * np.sin(np.pi / 2 * (1 + x))
+    otf = np.array([hopkins(value, waves) for value in q])
+    for share in (0.05, 0.2, 0.5, 0.8):
+        v = share * psf.end
+        expected = 2 * v * weights @ (otf * special.j1(2 * q * v))
+        assert psf.within(v) == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize("waves", [0.0, 0.05, 0.3, 2.0])
+@pytest.mark.parametrize("weight", [0.0, 0.03])
+def test_a_pupil_with_a_bright_side(waves: float, weight: float) -> None:
+    """Against the field of 300 x 96 points of a pupil whose amplitude is larger on one side, squared."""
+    psf, s = pattern(waves, weight), 1e-4
+    nodes, shares = np.polynomial.legendre.leggauss(300)
+    u, turn = (1 + nodes[:, None]) / 2, 2 * np.pi * np.arange(96) / 96
+    element = shares[:, None] / 2 * u * 2 * np.pi / 96 * np.exp(2j * np.pi * waves * u**2) / (1 + weight * u**2)
+
+    def light(v: float, angle: float, side: float) -> float:
+        tilted = element * (1 + side * u * np.cos(turn) / (1 + weight * u**2))
+        # A point of a pupil that is defocused outwards sends its ray outwards.
+        return float(np.abs((tilted * np.exp(-1j * v * u * np.cos(turn - angle))).sum()) ** 2)
+
+    for v in (0.7, 2.5, 6.0):
+        middle = light(v, 0.4, 0.0)
+        whole = 2 * np.pi**2 * 2 / (2 * (1 + weight))  # by Parseval, of v dv
+        assert psf.spread(np.array([v]))[0] == pytest.approx(v * middle / whole, rel=1e-6)
+        change = (light(v, 0.4, s) - light(v, 0.4, -s)) / (2 * s)
+        assert psf.slant(np.array([v]))[0] * np.cos(0.4) == pytest.approx(v * change / whole, abs=1e-6)
+
+
+def test_quantiles_encircle_their_shares() -> None:
+    psf, share = pattern(0.3), np.linspace(0, 1, 101)
+    radii = psf.quantiles(100)
+    np.testing.assert_allclose(psf.within(radii) / psf.encircled, share**2, atol=2e-3)

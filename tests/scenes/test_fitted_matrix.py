@@ -33,7 +33,8 @@ from ommatid.scenes.optics import boxes
 from ommatid.scenes.optics.footprints import sub_matrix
 from ommatid.scenes.pose import Misalignment, pose_of
 
-from ..examples import camera
+from ..examples import camera, not_none
+from ..frames import assert_acts_as, assert_window
 
 ODD = (("1/3", [2, 2], [4, 5]), ("2/5", [2, 1], [3, 4]))
 lengths = st.floats(-0.005, 0.005)
@@ -78,41 +79,20 @@ def test_displaced_boxes_are_exact_areas(row: float, column: float, magnificatio
         assert abs(sparse.csr_array(product) - entries(cam, sub, numbers)).max() < 1e-9
 
 
-def test_its_last_digits_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    cam, rng = camera((70, 61), ODD), np.random.default_rng(0)
-    fitted = with_numbers(cam, np.array([0.3, -1.7, 0.01, 0.0, 0.0]))
-    f, g, found = rng.normal(size=cam.unknowns), rng.normal(size=cam.measurements), set[bytes]()
+def test_it_is_applied_as_its_entries_are_by_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    cam, numbers = camera((70, 61), ODD), np.array([0.3, -1.7, 0.01, 0.0, 0.0])
+    fitted = with_numbers(cam, numbers)
+    observation, rng, found = not_none(fitted.observation), np.random.default_rng(0), set[bytes]()
+    assert (fitted.is_as_designed, fitted.is_nearly_designed) == (False, False)
+    assert with_numbers(cam, numbers / 50).is_nearly_designed
+    assert_acts_as(observation, fitted.to_sparse())
+    assert assert_window(observation, fitted.to_sparse(), slice(5, 40), slice(3, 30))
+    f, g = rng.normal(size=cam.unknowns), rng.normal(size=cam.measurements)
     monkeypatch.setattr(boxes, "SLOW", 0)
     for count in (1, 2, 5):
         monkeypatch.setattr(observations, "processors", lambda count=count: count)
-        assert fitted.observation is not None
-        found.add(fitted.observation.forward(f).tobytes() + fitted.observation.adjoint(g).tobytes())
+        found.add(observation.forward(f).tobytes() + observation.adjoint(g).tobytes())
     assert len(found) == 1
-    stored = fitted.to_sparse()
-    assert fitted.observation is not None
-    np.testing.assert_allclose(fitted.observation.forward(f), stored @ f, atol=1e-12)
-    np.testing.assert_allclose(fitted.observation.adjoint(g), stored.T @ g, atol=1e-12)
-
-
-def test_it_is_applied_without_entries_as_with_them() -> None:
-    cam, rng = camera((70, 61), ODD), np.random.default_rng(0)
-    numbers = np.array([0.3, -1.7, 0.01, 0.0, 0.0])
-    fitted = with_numbers(cam, numbers)
-    observation = fitted.observation
-    assert observation is not None
-    assert not fitted.is_as_designed
-    assert not fitted.is_nearly_designed
-    assert with_numbers(cam, numbers / 50).is_nearly_designed
-    stored, f, g = fitted.to_sparse(), rng.normal(size=cam.unknowns), rng.normal(size=cam.measurements)
-    np.testing.assert_allclose(observation.forward(f), stored @ f, atol=1e-12)
-    np.testing.assert_allclose(observation.adjoint(g), stored.T @ g, atol=1e-12)
-    window = slice(5, 40), slice(3, 30)
-    rows = observation.measurements_inside(*window)
-    inside = stored[rows].toarray().reshape(-1, 70, 61)
-    assert inside[:, window[0], window[1]].sum() == pytest.approx(inside.sum(), rel=1e-12)
-    np.testing.assert_allclose(
-        observation.submatrix(*window).toarray(), inside[:, window[0], window[1]].reshape(rows.size, -1), atol=1e-12
-    )
 
 
 @pytest.mark.parametrize("number", range(COUNT))

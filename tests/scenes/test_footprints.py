@@ -50,9 +50,7 @@ def image_tangents(cam: Camera, sub: SubImager, pose: Pose, row: Vector, column:
 
 @pytest.mark.parametrize(("shape", "lenses"), [((19, 19), THREE), ((23, 17), TWO_FIFTHS)])
 @pytest.mark.parametrize("optics", [LensOptics(), LensOptics(distortion=(0.0, 0.0))])
-def test_without_distortion_it_is_a_product_of_intervals(
-    shape: tuple[int, int], lenses: Lenses, optics: LensOptics
-) -> None:
+def test_undistorted_it_is_a_product_of_intervals(shape: tuple[int, int], lenses: Lenses, optics: LensOptics) -> None:
     ideal = camera(shape, lenses)
     cam = replace(ideal, types=tuple(replace(lens_type, optics=optics) for lens_type in ideal.types))
     for sub, pixels in zip(cam.sub_imagers, cam.slices(), strict=True):
@@ -148,9 +146,7 @@ def test_a_misaligned_pinhole_against_clipped_polygons() -> None:
         ((("1/2", [1, 1], "fit"),), (0.8, 0.5), NUDGED),  # one texel's image across many pixels
     ],
 )
-def test_a_texels_column_is_the_area_of_its_image(
-    lenses: Lenses, k: tuple[float, float], misalignment: Misalignment
-) -> None:
+def test_texels_columns_are_areas_of_images(lenses: Lenses, k: tuple[float, float], misalignment: Misalignment) -> None:
     """Conservation of area, by quadrature over the texel of the patch's area per area of the target."""
     cam = distorted(camera(lenses=lenses), *k)
     for sub in cam.sub_imagers[::4]:

@@ -19,7 +19,7 @@ from ommatid.scenes.tables.toml import apply_overrides
 from ommatid.scenes.tables.units import FACTORS
 
 from ..conftest import TINY
-from ..examples import scene
+from ..examples import not_none, scene
 from ..modules import tracked
 
 
@@ -34,35 +34,21 @@ def test_gallery_reads_and_survives_writing(path: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "millimetres"),
+    ("key", "texts", "value"),
     [
-        ("6 um", 0.006),
-        ("1 inch", 25.4),
-        ("0.5mm", 0.5),
-        ("1 µm", 0.001),
-        (" 6 um ", 0.006),
-        ("1/4 mm", 0.25),
+        ("target.pixel_pitch", ["6 um", "0.006mm", " 6 um ", "6 µm", "6/1000 mm"], 0.006),
+        ("target.distance", ["1 inch", "25.4 mm"], 25.4),
+        ("camera.tolerance.tilt", ["1 deg", "1°", "60 arcmin"], radians(1)),
+        ("camera.lens.A.magnification", ["3/10", "0.3"], Fraction(3, 10)),
+        ("camera.lens.A.magnification", ["1", "1.0"], Fraction(1)),
     ],
 )
-def test_lengths_become_millimetres(text: str, millimetres: float) -> None:
-    changed = with_changes(scene().plain(), Path("a.toml"), [f'target.pixel_pitch="{text}"'], ())
-    assert changed.target.pixel_pitch == pytest.approx(millimetres, rel=1e-12)
-
-
-@pytest.mark.parametrize(("text", "degrees"), [("1 deg", 1.0), ("1°", 1.0), ("60 arcmin", 1.0)])
-def test_angles_become_radians(text: str, degrees: float) -> None:
-    changed = with_changes(scene().plain(), Path("a.toml"), [f'camera.tolerance={{tilt="{text}"}}'], ())
-    assert changed.camera.tolerance is not None
-    assert changed.camera.tolerance.tilt == pytest.approx(radians(degrees), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("value", "ratio"),
-    [('"1/3"', Fraction(1, 3)), ("0.25", Fraction(1, 4)), ("1", Fraction(1)), ('"3/10"', Fraction(3, 10))],
-)
-def test_magnification_is_an_exact_ratio(value: str, ratio: Fraction) -> None:
-    changed = with_changes(scene().plain(), Path("a.toml"), [f"camera.lens.A.magnification={value}"], ())
-    assert changed.camera.lens[0].magnification == ratio
+def test_quantities_are_millimetres_radians_and_exact_ratios(key: str, texts: list[str], value: Any) -> None:
+    for text in texts:
+        changed: Any = with_changes(scene().plain(), Path("a.toml"), [f'{key}="{text}"'], ())
+        for name in key.split("."):
+            changed = changed[0] if name == "A" else getattr(changed, name)
+        assert changed == (value if isinstance(value, Fraction) else pytest.approx(value, rel=1e-12))
 
 
 @given(st.floats(min_value=1e-6, max_value=1e6), st.sampled_from(["nm", "um", "mm", "cm", "m", "km"]))
@@ -75,11 +61,9 @@ def test_a_length_survives_writing_to_the_last_bit(number: float, unit: str) -> 
 def test_overrides_set_create_and_remove() -> None:
     changes = ["noise.variance=1e-6", "noise.bits=12", "title=plain words", "estimator.noise_variance=1e-3"]
     changed = with_changes(scene().plain(), Path("a.toml"), changes, ())
-    assert changed.noise is not None
-    assert (changed.noise.variance, changed.noise.bits, changed.title) == (1e-6, 12, "plain words")
+    assert (not_none(changed.noise).variance, not_none(changed.noise).bits, changed.title) == (1e-6, 12, "plain words")
     removed = with_changes(changed.plain(), Path("a.toml"), ["noise.bits=", "estimator.noise_variance="], ())
-    assert removed.noise is not None
-    assert removed.noise.bits is None
+    assert not_none(removed.noise).bits is None
     assert removed.estimator.noise_variance is None
 
 
@@ -114,6 +98,13 @@ def test_lens_types_are_kept_in_the_order_named_and_doubled() -> None:
     assert kept.camera.lens[2].magnification == Fraction(1, 5)
 
 
+EXPOSED = 'illuminance="500 lux", exposure="10 ms"'
+NO_ACCEPTANCE = (
+    *('[["2 deg", 1], ["1 deg", 0.5]]', '[["90 deg", 0.5]]', '[["5 deg", 0]]', "[[5, 1]]", '[["5 deg"]]'),
+    *("[]", "[7]", "5"),
+)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -127,11 +118,22 @@ def test_lens_types_are_kept_in_the_order_named_and_doubled() -> None:
         ("camera.lens.Z.array=[1, 1]", ["'Z'", "'A'"]),
         ("estimator.misalignment=robust", ["estimator.misalignment", "withdrawn; take 'fit'"]),
         ("estimator.method=svd", ["estimator.method", "take 'auto'"]),
+        ('prior={kind="exponential"}', ["needs a correlation_length"]),
+        ('prior={correlation_length="1 mm"}', ["belongs to kind"]),
+        ('prior={kind="exponential", correlation_length=3.0}', ["bare number"]),
+        ('prior={kind="exponential", correlation_length="1 mm", exponent=2.0}', ["exponent belongs"]),
+        ("prior={variance=0.0}", ["above 0"]),
+        ('prior={kind="gaussian"}', ["'independent', 'exponential', 'power' or 'fit'"]),
+        *((f"sensor={{{EXPOSED}, acceptance={curve}}}", ["acceptance"]) for curve in NO_ACCEPTANCE),
+        (f'sensor={{{EXPOSED}, acceptance=[["5 deg", 0.9]]}}', ["walls"]),
     ],
 )
 def test_refusals_name_file_key_and_what_was_expected(change: str, words: list[str]) -> None:
+    plain = scene(calibration={"method": "transport"}).plain()
+    if "sensor" in change:
+        plain["camera"]["walls"] = "walls" not in words
     with pytest.raises(InputError) as refusal:
-        with_changes(scene().plain(), Path("a.toml"), [change], ())
+        with_changes(plain, Path("a.toml"), [change], ())
     message = str(refusal.value)
     assert message.startswith(("a.toml: ", "a.toml with --set "))
     assert "\n" not in message

@@ -15,6 +15,8 @@ from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse
 
+from ..examples import not_none
+
 LENS = {"name": "I", "magnification": "1/3", "array": [1, 1], "pixels": [5, 5]}
 
 
@@ -165,8 +167,7 @@ def test_any_sufficient_set_describes_the_same_camera(
 
 def optics_of(camera: Camera) -> tuple[float, float, float]:
     lens = camera.types[0]
-    assert lens.optics.aperture is not None
-    return camera.depth(lens), camera.focal_length(lens), lens.optics.aperture
+    return camera.depth(lens), camera.focal_length(lens), not_none(lens.optics.aperture)
 
 
 def test_the_schema_allows_every_key_that_may_follow_from_others_to_be_absent() -> None:

@@ -16,7 +16,7 @@ from ommatid.scenes.recording import Recording
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.sensor import SensorTable
 
-from ..examples import THREE, camera, scene
+from ..examples import THREE, camera, not_none, scene, with_keys
 
 
 def example(seed: int = 0) -> Stack:
@@ -32,8 +32,7 @@ def sensor_example(seed: int = 0) -> Stack:
     rng, first = np.random.default_rng(seed), example(seed)
     thin = tuple(lens.model_copy(update={"aperture": 0.1}) for lens in first.scene.camera.lens)
     sensor = SensorTable.model_validate({"illuminance": "500 lux", "exposure": "1 ms", "black_level": 10.0})
-    changes = {"sensor": sensor, "camera": first.scene.camera.model_copy(update={"lens": thin})}
-    described = first.scene.model_copy(update=changes)
+    described = with_keys(first.scene, camera={"lens": thin}).model_copy(update={"sensor": sensor})
     cam = derive(described)
     dark = rng.normal(10, 1, cam.measurements).astype(np.float32).astype(np.float64)
     flat = dark + np.repeat([1000.0, 2000.0, 1500.0], [lens_type.measurements for lens_type in cam.types])
@@ -107,10 +106,9 @@ def test_a_recording_is_read_as_written(tmp_path: Path) -> None:
     stack.write(tmp_path / "stack.exr", first)
     again = stack.read(tmp_path / "stack.exr")
     assert first.recording is not None
-    assert again.recording is not None
-    assert again.recording.sensor == first.recording.sensor
+    assert not_none(again.recording).sensor == first.recording.sensor
     for name in ("digital", "dark", "flat", "flat_value"):
-        np.testing.assert_array_equal(getattr(again.recording, name), getattr(first.recording, name))
+        np.testing.assert_array_equal(getattr(not_none(again.recording), name), getattr(first.recording, name))
     np.testing.assert_array_equal(again.values, first.values)
     assert np.flatnonzero(np.isnan(again.values)).tolist() == [5]
     stack.write(tmp_path / "again.exr", again)
@@ -121,10 +119,9 @@ def test_a_recording_is_read_as_written(tmp_path: Path) -> None:
         exr.read(tmp_path / "stack.exr")[0].channels["Y"].ravel(), first.recording.digital[:25]
     )
     kept, whole = again.restrict(("A", "C")), first.restrict(("A", "C"))
-    assert kept.recording is not None
-    assert kept.recording.digital.size == kept.camera.measurements == 481
+    assert not_none(kept.recording).digital.size == kept.camera.measurements == 481
     np.testing.assert_array_equal(kept.values, whole.values)
-    np.testing.assert_array_equal(kept.recording.values, kept.values)
+    np.testing.assert_array_equal(not_none(kept.recording).values, kept.values)
 
 
 def test_a_sensor_s_stack_without_frames_is_refused(tmp_path: Path) -> None:
@@ -145,10 +142,7 @@ def test_a_sensor_s_stack_without_frames_is_refused(tmp_path: Path) -> None:
 def test_a_stack_names_no_file_that_is_read(key: str, tmp_path: Path) -> None:
     first = example()
     lenses = (first.scene.camera.lens[0].model_copy(update={"surfaces": "/dev/zero"}), *first.scene.camera.lens[1:])
-    changes = {
-        "surfaces": {"camera": first.scene.camera.model_copy(update={"lens": lenses})},
-        "shape": {"target": first.scene.target.model_copy(update={"shape": None})},
-    }[key]
-    stack.write(tmp_path / "s.exr", replace(first, scene=first.scene.model_copy(update=changes)))
+    changes = {"surfaces": {"camera": {"lens": lenses}}, "shape": {"target": {"shape": None}}}[key]
+    stack.write(tmp_path / "s.exr", replace(first, scene=with_keys(first.scene, **changes)))
     with pytest.raises(InputError, match="expected a scene with"):
         stack.read(tmp_path / "s.exr")

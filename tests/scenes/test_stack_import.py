@@ -14,25 +14,30 @@ from ommatid.scenes.camera import Camera
 from ommatid.scenes.hardware.frames import patches, stored_pictures
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import read
+from ommatid.scenes.stack import Stack
 from ommatid.simulate.ideal import ideal_model
 
-from ..conftest import Command
+from ..conftest import Command, Ended
+from ..examples import not_none
 from .mosaics import SCENE, SENSOR, SHAPE, Array, as_mosaic, assert_error_as_expected, recorded_image, save
+
+
+def imported(ommatid: Command, *arguments: str | Path) -> tuple[Stack, Ended]:
+    """The stack that a command makes of pictures, and the command's output."""
+    ended = ommatid("import", "scene.toml", *arguments, "-o", "s.exr")
+    assert ended.code == 0, ended.err
+    return stack.read(Path("s.exr")), ended
 
 
 @pytest.mark.parametrize(
     ("name", "dtype", "step"),
     [("m.png", np.uint16, 1), ("m.tiff", np.uint16, 1), ("m.npy", np.float64, 0), ("m.exr", np.float32, 0)],
 )
-def test_a_mosaic_is_cut_into_the_sub_images(
-    imaging_camera: Camera, ommatid: Command, name: str, dtype: type[Any], step: int
-) -> None:
+def test_a_mosaic_is_cut_up(imaging_camera: Camera, ommatid: Command, name: str, dtype: type[Any], step: int) -> None:
     _, values = recorded_image(imaging_camera)
     values = np.rint(values + 1000) if step else values.astype(np.float32).astype(np.float64)
     mosaic = save(Path(name), as_mosaic(imaging_camera, values).astype(dtype))
-    ended = ommatid("import", "scene.toml", mosaic, "-o", "stack.exr", "--json")
-    assert ended.code == 0, ended.err
-    cut = stack.read(Path("stack.exr"))
+    cut, ended = imported(ommatid, mosaic, "--json")
     np.testing.assert_array_equal(cut.values, values.astype(np.float32))
     assert not cut.rendering_variance.any()
     described = json.loads(ended.out)
@@ -41,7 +46,7 @@ def test_a_mosaic_is_cut_into_the_sub_images(
     assert "beside whole pixels" in ended.err
 
 
-def test_letters_on_the_sensor_become_upright(tmp_path: Path, ommatid: Command) -> None:
+def test_letters_on_the_sensor_become_upright(ommatid: Command) -> None:
     """Worked by hand: four lenses 20 pixels apart see the same point, so their patches are slightly further apart.
 
     The letters are upside down on the sensor, and the one at the top left is that of sub-imager (0, 0).
@@ -55,7 +60,7 @@ array = [2, 2]
 pixels = [5, 4]
 step = 0
 """
-    (tmp_path / "scene.toml").write_text(scene, encoding="utf-8")
+    Path("scene.toml").write_text(scene, encoding="utf-8")
     mosaic = np.zeros((50, 60), dtype=np.uint8)
     expected: list[Array] = []
     for number, (row, column) in enumerate([(15, 20), (15, 40), (35, 20), (35, 40)]):
@@ -64,14 +69,11 @@ step = 0
         top = {15: 12, 35: 33}[row]
         mosaic[top : top + 5, column - 2 : column + 2] = image[::-1, ::-1]
         expected.append(image)
-    picture, out = save(tmp_path / "m.png", mosaic), tmp_path / "s.exr"
-    ended = ommatid("import", tmp_path / "scene.toml", picture, "-o", out)
-    assert ended.code == 0, ended.err
-    images = stack.read(out).images()
-    np.testing.assert_array_equal(images, expected)
-    ended = ommatid("import", tmp_path / "scene.toml", picture, "-o", out, "--upright")
-    assert ended.code == 0, ended.err
-    np.testing.assert_array_equal(stack.read(out).images(), np.array(expected)[:, ::-1, ::-1])
+    picture = save(Path("m.png"), mosaic)
+    np.testing.assert_array_equal(imported(ommatid, picture)[0].images(), expected)
+    np.testing.assert_array_equal(
+        imported(ommatid, picture, "--upright")[0].images(), np.array(expected)[:, ::-1, ::-1]
+    )
 
 
 def test_the_origin_is_the_corner_of_the_first_patch(imaging_camera: Camera, ommatid: Command) -> None:
@@ -81,13 +83,11 @@ def test_the_origin_is_the_corner_of_the_first_patch(imaging_camera: Camera, omm
     top, left = nearest.min(axis=0).tolist()
     save(Path("cut.npy"), mosaic[top:, left:])
     row, column = (nearest[0] - nearest.min(axis=0)).tolist()
-    ended = ommatid("import", "scene.toml", "cut.npy", "-o", "s.exr", "--origin", f"{row},{column}", "--json")
-    assert ended.code == 0, ended.err
+    cut, ended = imported(ommatid, "cut.npy", "--origin", f"{row},{column}", "--json")
     exact = patches(imaging_camera) - patches(imaging_camera)[0]
     beside = np.abs(exact - np.rint(exact)).max()
     assert json.loads(ended.out)["beside_pixels"] == pytest.approx(beside, abs=1e-9)
-    first = stack.read(Path("s.exr")).images()[0]
-    np.testing.assert_array_equal(first.ravel(), values[imaging_camera.slices()[0]].astype(np.float32))
+    np.testing.assert_array_equal(cut.images()[0].ravel(), values[imaging_camera.slices()[0]].astype(np.float32))
 
 
 def test_single_pictures_are_in_the_order_of_measurements(imaging_camera: Camera, ommatid: Command) -> None:
@@ -99,9 +99,9 @@ def test_single_pictures_are_in_the_order_of_measurements(imaging_camera: Camera
     for number, picture in enumerate(upright):
         save(Path(f"turned/{number:02d}.npy"), picture[::-1, ::-1])
     for pictures in (names, ["turned", "--turned"]):
-        ended = ommatid("import", "scene.toml", *pictures, "-o", "s.exr")
-        assert (ended.code, "beside" in ended.err) == (0, False), ended.err
-        np.testing.assert_array_equal(stack.read(Path("s.exr")).values, values.astype(np.float32))
+        made, ended = imported(ommatid, *pictures)
+        assert "beside" not in ended.err
+        np.testing.assert_array_equal(made.values, values.astype(np.float32))
 
 
 def test_dark_and_flat_frames_remove_offsets_and_gains_of_pixels(imaging_camera: Camera, ommatid: Command) -> None:
@@ -115,11 +115,10 @@ def test_dark_and_flat_frames_remove_offsets_and_gains_of_pixels(imaging_camera:
         save(Path(f"flat{number}.npy"), as_mosaic(imaging_camera, offset + 200 * gain + spread[number]))
     save(Path("image.npy"), as_mosaic(imaging_camera, offset + gain * values))
     files = ["--dark", "dark0.npy", "--dark", "dark1.npy", "--flat", "flat0.npy", "--flat", "flat1.npy"]
-    ended = ommatid("import", "scene.toml", "image.npy", "-o", "s.exr", *files, "--flat-value", "200")
-    assert ended.code == 0, ended.err
-    np.testing.assert_allclose(stack.read(Path("s.exr")).values, values, rtol=1e-5, atol=1e-3)
-    ended = ommatid("import", "scene.toml", "image.npy", "-o", "s.exr", "--dark", "dark0.npy")
-    np.testing.assert_allclose(stack.read(Path("s.exr")).values, gain * values - spread[0], rtol=1e-5, atol=1e-3)
+    made, _ = imported(ommatid, "image.npy", *files, "--flat-value", "200")
+    np.testing.assert_allclose(made.values, values, rtol=1e-5, atol=1e-3)
+    made, _ = imported(ommatid, "image.npy", "--dark", "dark0.npy")
+    np.testing.assert_allclose(made.values, gain * values - spread[0], rtol=1e-5, atol=1e-3)
 
 
 def test_pixels_with_a_flat_not_above_the_dark_are_dead(imaging_camera: Camera, ommatid: Command) -> None:
@@ -128,10 +127,9 @@ def test_pixels_with_a_flat_not_above_the_dark_are_dead(imaging_camera: Camera, 
     flat[3], flat[70], dark[90] = 10.0, np.nan, 300.0
     for name, numbers in (("image", 10 + values), ("dark", dark), ("flat", flat)):
         save(Path(f"{name}.npy"), as_mosaic(imaging_camera, numbers))
-    ended = ommatid("import", "scene.toml", "image.npy", "-o", "s.exr", "--dark", "dark.npy", "--flat", "flat.npy")
-    assert ended.code == 0, ended.err
+    made, ended = imported(ommatid, "image.npy", "--dark", "dark.npy", "--flat", "flat.npy")
     assert "3 sensor pixels are dead" in ended.err
-    assert set(np.flatnonzero(np.isnan(stack.read(Path("s.exr")).values))) == {3, 70, 90}
+    assert np.flatnonzero(np.isnan(made.values)).tolist() == [3, 70, 90]
 
 
 def test_with_a_sensor_the_stack_holds_digital_numbers(imaging_camera: Camera, ommatid: Command) -> None:
@@ -143,17 +141,11 @@ def test_with_a_sensor_the_stack_holds_digital_numbers(imaging_camera: Camera, o
         pixels = as_mosaic(imaging_camera, np.broadcast_to(np.float64(numbers), values.shape), outside=100)
         save(Path(f"{name}.png"), pixels.astype(np.uint16))
     frames = ["--dark", "dark.png", "--flat", "flat.png"]
-    ended = ommatid("import", "scene.toml", "image.png", "-o", "s.exr", *frames)
-    assert ended.code == 0, ended.err
-    made = stack.read(Path("s.exr"))
-    assert made.recording is not None
-    np.testing.assert_array_equal(made.recording.digital, digital)
+    made = imported(ommatid, "image.png", *frames)[0]
+    np.testing.assert_array_equal(not_none(made.recording).digital, digital)
     np.testing.assert_allclose(made.values, (digital - 100) / 7)
-    assert made.recording.sensor.frames == 50
-    ended = ommatid("import", "scene.toml", "image.png", "-o", "s.exr", *frames, *frames)
-    made = stack.read(Path("s.exr"))
-    assert made.recording is not None
-    assert made.recording.sensor.frames == 2
+    again = imported(ommatid, "image.png", *frames, *frames)[0]
+    assert [not_none(each.recording).sensor.frames for each in (made, again)] == [50, 2]
     ended = ommatid("import", "scene.toml", "image.png", "-o", "s.exr")
     assert ended.code == 2
     assert "--dark" in ended.err
@@ -162,7 +154,7 @@ def test_with_a_sensor_the_stack_holds_digital_numbers(imaging_camera: Camera, o
 def test_an_imported_stack_is_reconstructed_with_the_predicted_error(imaging_camera: Camera, ommatid: Command) -> None:
     image, values = recorded_image(imaging_camera)
     save(Path("m.npy"), as_mosaic(imaging_camera, values))
-    assert ommatid("import", "scene.toml", "m.npy", "-o", "s.exr").code == 0
+    imported(ommatid, "m.npy")
     scene = read(Path("scene.toml"))
     made = ideal_model(scene, imaging_camera)
     record = {"method": "ideal", "versions": {}, "seconds": 0.0}
@@ -240,18 +232,16 @@ def test_what_is_missing_or_turned_gives_a_warning(imaging_camera: Camera, ommat
     commands = {("m.npy", *both): "", ("turned.npy", *both): "turned by 180 degrees, the mosaic has"}
     commands |= {("m.npy", *both[:2]): "--dark without --flat", ("m.npy", *both[2:]): "--flat without --dark"}
     for arguments, words in commands.items():
-        ended = ommatid("import", "scene.toml", "-o", "s.exr", *arguments)
-        warnings = [line for line in ended.err.splitlines() if line.startswith("warning")]
-        assert (ended.code, len(warnings)) == (0, 1 + bool(words)), ended.err  # one on the places of the sub-images
-        assert words in ended.err
+        said = imported(ommatid, *arguments)[1].err
+        assert said.count("warning") == 1 + bool(words), said  # one on the places of the sub-images
+        assert words in said
 
 
 def test_a_restricted_import_still_has_all_types_on_the_sensor(imaging_camera: Camera, ommatid: Command) -> None:
     _, values = recorded_image(imaging_camera)
     save(Path("m.npy"), as_mosaic(imaging_camera, values))
-    assert ommatid("import", "scene.toml", "m.npy", "-o", "s.exr", "--lens", "II").code == 0
     expected = values[imaging_camera.type_slices()[1]].astype(np.float32)
-    np.testing.assert_array_equal(stack.read(Path("s.exr")).values, expected)
+    np.testing.assert_array_equal(imported(ommatid, "m.npy", "--lens", "II")[0].values, expected)
 
 
 def test_a_colour_array_is_one_picture(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
-"""Sub-imagers with windows and orientations of their own."""
+"""Sub-imagers with windows and orientations of their own, and arrays with other steps down than across."""
 
 from __future__ import annotations
 
+import json
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ommatid.reconstruct.restore import restore
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.scenes.camera import Camera, derive
@@ -17,13 +17,13 @@ from ommatid.scenes.hardware.point_sources import unrecorded
 from ommatid.scenes.scene import Scene, parse, read, write
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
-from ommatid.simulate.ideal import ideal_matrix, ideal_model
+from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import light
 from ommatid.simulate.sampling.passes import rounding_variance
 
 from ..conftest import Command
-from ..examples import GALLERY, assert_student, needs, scene
-from ..frames import assert_methods_agree, observed, recorded
+from ..examples import GALLERY, assert_student, needs, scene, slow, with_keys
+from ..frames import assert_acts_as, assert_methods_agree, assert_window, observed
 from ..runs import document
 
 FINE = 12  # cells of a pixel of f, so that edges of footprints lie on edges of cells
@@ -31,25 +31,26 @@ WINDOWS: dict[tuple[int, int], tuple[Any, Any]] = {(0, 0): (0, 0), (0, 2): ("3/2
 ANGLE = 0.1
 
 
-def steered(
-    named: dict[tuple[int, int], dict[str, Any]], shape: tuple[int, int] = (20, 18), more: Any = None, **tables: Any
-) -> Scene:
-    """Two lens types, the first with these sub-imagers off its grid."""
+def described(first: dict[str, Any], shape: tuple[int, int] = (20, 18), **tables: Any) -> Scene:
+    """Two lens types, the first with these keys."""
     data = scene(shape, (("1/3", [2, 3], [3, 3]), ("1/2", [2, 2], [6, 6])), **tables).plain()
-    data["camera"]["lens"][0]["sub_imager"] = [{"at": list(at), **keys} for at, keys in named.items()]
-    data["camera"]["lens"][0].update(more or {})
+    data["camera"]["lens"][0] |= first
     return parse(data, Path("test.toml"))
+
+
+def steered(named: dict[tuple[int, int], dict[str, Any]], more: Any = None, **tables: Any) -> Scene:
+    """These sub-imagers of the first lens type are off its grid."""
+    return described({"sub_imager": [{"at": list(at), **keys} for at, keys in named.items()], **(more or {})}, **tables)
 
 
 def windows(**tables: Any) -> Scene:
     return steered({at: {"window": list(window)} for at, window in WINDOWS.items()}, **tables)
 
 
-def by_counting(camera: Camera) -> FloatArray:
-    """Return H by counting cells of windows that are written out here."""
-    grid = {(k, l): (5 + k, 3 + l) for k in range(2) for l in range(3)} | WINDOWS  # noqa: E741
-    blocks = [(grid[k, l], 3, 3) for k in range(2) for l in range(3)]  # noqa: E741
-    blocks += [((3 + k, 2 + l), 2, 6) for k in range(2) for l in range(2)]  # noqa: E741
+def by_counting(camera: Camera, first: dict[tuple[int, int], tuple[Any, Any]]) -> FloatArray:
+    """Return H by counting cells of windows that are written out here; first : those of the first lens type."""
+    blocks = [(window, 3, 3) for window in first.values()]
+    blocks += [((3 + k, 2 + l), 2, 6) for k, l in np.ndindex(2, 2)]  # noqa: E741
     rows: list[FloatArray] = []
     for window, ratio, count in blocks:
         top, left = (int(Fraction(number) * FINE) for number in window)
@@ -71,26 +72,32 @@ def test_pixels_seen_by_a_rotated_window_are_those_whose_whole_light_is_in_h() -
     np.testing.assert_array_equal(camera.types_seeing(), whole)
 
 
-def test_h_is_that_of_counted_cells() -> None:
-    camera = derive(windows())
-    counted = by_counting(camera)
+GRID = list(np.ndindex(2, 3))
+STEPS = {  # of the array, and where its first window is, so that all of them lie in the middle
+    "[2, 1]": (4, 3),
+    "[1, 2]": (5, 2),
+    '["1/2", 2]': (5, 2),
+    '[0, "3/4"]': (5, 4),
+}
+
+
+@pytest.mark.parametrize("step", [None, *STEPS])
+def test_h_is_that_of_counted_cells(step: str | None) -> None:
+    """Of sub-imagers whose windows are named, and of windows that are shifted by other numbers down than across."""
+    if step is None:
+        camera, first = derive(windows()), {(k, l): (5 + k, 3 + l) for k, l in GRID} | WINDOWS  # noqa: E741
+    else:
+        camera, (down, across) = derive(described({"step": json.loads(step)})), map(Fraction, json.loads(step))
+        top, left = STEPS[step]
+        first = {(k, l): (top + k * down, left + l * across) for k, l in GRID}  # noqa: E741
+        assert camera.types[0].step == (down, across)
+    counted = by_counting(camera, first)
     np.testing.assert_allclose(ideal_matrix(camera).toarray(), counted, atol=1e-14)
-    boxes, rng = observed(camera), np.random.default_rng(0)
-    image, readings = rng.normal(size=camera.unknowns), rng.normal(size=camera.measurements)
-    np.testing.assert_allclose(boxes.forward(image), counted @ image, atol=1e-12)
-    np.testing.assert_allclose(boxes.adjoint(readings), counted.T @ readings, atol=1e-12)
-    part = slice(2, 15), slice(1, 16)
-    inside = boxes.measurements_inside(*part)
-    outside = np.ones(camera.shape, dtype=np.bool_)
-    outside[part] = False
-    assert set(inside) == set(np.flatnonzero(counted[:, outside.ravel()].sum(axis=1) == 0))
-    columns = counted[inside].reshape(-1, *camera.shape)[:, part[0], part[1]].reshape(inside.size, -1)
-    np.testing.assert_allclose(boxes.submatrix(*part).toarray(), columns, atol=1e-14)
-
-
-def test_pixels_seen_are_those_of_the_windows() -> None:
-    camera = derive(windows())
-    counted = by_counting(camera)
+    assert_acts_as(observed(camera), counted)
+    outside = np.ones(camera.shape)
+    outside[2:15, 1:16] = 0
+    inside = assert_window(observed(camera), counted, slice(2, 15), slice(1, 16))
+    assert inside == np.flatnonzero(counted @ outside.ravel() == 0).tolist()
     some = sum((counted[part].sum(axis=0) > 1e-9).astype(int) for part in camera.type_slices())
     np.testing.assert_array_equal(unrecorded(camera, np.zeros((0, 2), dtype=np.int64)), np.flatnonzero(some))
 
@@ -131,9 +138,9 @@ OPTICS: dict[str, dict[str, Any]] = {
     ("variant", "optics", "rotation"),
     [
         ("llvm_ad_mono", "pinhole", "5 deg"),
-        pytest.param("scalar_rgb", "pinhole", None, marks=pytest.mark.slow),
-        *(pytest.param("llvm_ad_mono", name, None, marks=pytest.mark.slow) for name in OPTICS),
-        pytest.param("llvm_ad_mono", "distorted", "5 deg", marks=pytest.mark.slow),
+        slow("scalar_rgb", "pinhole", None),
+        *(slow("llvm_ad_mono", name, None) for name in OPTICS),
+        slow("llvm_ad_mono", "distorted", "5 deg"),
     ],
 )
 def test_rendered_against_the_closed_form(variant: str, optics: str, rotation: str | None) -> None:
@@ -153,9 +160,7 @@ def test_rendered_against_the_closed_form(variant: str, optics: str, rotation: s
     assert_student(rendering.mean - ideal_matrix(setup.camera) @ setup.image.ravel(), variance, rendering.passes)
 
 
-@pytest.mark.parametrize(
-    ("method", "rotation"), [("transport", "5 deg"), pytest.param("points", None, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("method", "rotation"), [("transport", "5 deg"), slow("points", None)])
 def test_calibrated_against_the_closed_form(method: str, rotation: str | None) -> None:
     """Entry by entry, by the variance that the calibration states from its batches."""
     needs("llvm_ad_mono")
@@ -169,20 +174,23 @@ def test_calibrated_against_the_closed_form(method: str, rotation: str | None) -
     assert np.abs(difference).max() < 5 * np.sqrt(model.variance.max()) < 0.03, "entries are 1/9 and 1/4"
 
 
-@pytest.mark.parametrize("rotation", [None, "5 deg"])
-def test_dense_tiled_and_banded_estimates_agree(rotation: str | None) -> None:
-    turned = {} if rotation is None else {"rotation": rotation}
+ESTIMATED: dict[str, tuple[tuple[int, int], dict[str, Any], tuple[str, ...], int]] = {
+    "windows": ((20, 18), {"sub_imager": [{"at": [0, 0], "window": [0, 0]}]}, ("tiles", "frame"), 20),
+    "rotated": ((20, 18), {"sub_imager": [{"at": [1, 2], "window": [8, "17/4"], "rotation": "5 deg"}]}, ("frame",), 20),
+    "steps": ((24, 23), {"step": [2, 1], "array": [3, 3], "pixels": "fit"}, ("frame", "tiles"), 52),
+}
 
-    def described(method: str) -> Scene:
-        named = {(0, 0): {"window": [0, 0]}, (1, 2): {"window": [8, "17/4"], **turned}}
-        return steered(
-            named,
-            noise={"variance": 1e-2},
-            estimator={"method": method, "accuracy": 1e-6},
-            tiles={"size": 20, "overlap": 0},
-        )
 
-    assert_methods_agree(described, ("tiles", "frame"), 1e-3)
+@pytest.mark.parametrize("kind", ESTIMATED)
+def test_frames_and_tiles_agree_with_the_dense_estimate(kind: str) -> None:
+    shape, first, methods, size = ESTIMATED[kind]
+
+    def by(method: str) -> Scene:
+        estimator, tiles = {"method": method, "accuracy": 1e-6}, {"size": size, "overlap": 0}
+        made = described(first, shape, noise={"variance": 1e-2}, estimator=estimator, tiles=tiles)
+        return with_keys(made, camera={"lens_pitch": 50.0})
+
+    assert_methods_agree(by, methods, 1e-3)
 
 
 def whole_tile() -> Scene:
@@ -208,28 +216,31 @@ def test_a_camera_of_steered_windows_from_scene_file_to_verdict(tmp_path: Path, 
     assert given["low"] < report["error"]["mse"] < given["high"]
 
 
-@pytest.mark.slow
-def test_twenty_images_err_as_predicted() -> None:
-    """With the H in closed form the mean error has the variance 2 trace(C^2) / N^2."""
-    described = whole_tile()
-    camera = derive(described)
-    model, h = ideal_model(described, camera), ideal_matrix(camera).toarray()
-    covariance = np.linalg.inv(h.T @ h / 0.1 + np.eye(361) / 5461.25)
-    errors: list[float] = []
-    for seed in range(20):
-        image = 127.5 + np.random.default_rng(seed).normal(0, 5461.25**0.5, 361)
-        done = restore(recorded(described, image, 0.1, seed + 100), model, image)
-        assert done.expected.mse == pytest.approx(float(np.trace(covariance)) / 361, rel=1e-6)
-        assert done.error is not None
-        errors.append(done.error.mse)
-    spread = float(np.sqrt(2 * np.square(covariance).sum() / 20)) / 361
-    assert np.mean(errors) == pytest.approx(float(np.trace(covariance)) / 361, abs=3 * spread)
+def test_one_number_is_described_as_before_and_two_are_told_apart() -> None:
+    same = [derive(described({"step": step})).describe()["camera.lens.A"]["step"] for step in (1, "1", [1, 1])]
+    assert same == ["1"] * 3
+    assert described({"step": ["1/2", "1/2"]}).plain()["camera"]["lens"][0]["step"] == "1/2"
+    assert derive(described({"step": [2, 1]})).describe() != derive(described({"step": [1, 2]})).describe()
 
 
-def test_written_and_read_again(tmp_path: Path) -> None:
-    before = steered({(0, 2): {"window": ["3/2", 9], "rotation": "-1 deg"}})
+@pytest.mark.parametrize(
+    "first",
+    [
+        {"sub_imager": [{"at": [0, 2], "window": ["3/2", 9], "rotation": "-1 deg"}]},
+        *({"step": step} for step in (2, [2, 1], ["1/2", 2])),
+    ],
+)
+def test_written_and_read_again(first: dict[str, Any], tmp_path: Path) -> None:
+    before = described(first)
     write(tmp_path / "scene.toml", before)
-    assert derive(read(tmp_path / "scene.toml")).types[0].steered == derive(before).types[0].steered
+    assert derive(read(tmp_path / "scene.toml")).types[0] == derive(before).types[0]
+    assert read(tmp_path / "scene.toml", ["camera.lens.A.step=[3, 1]"]).camera.lens[0].step == (3, 1)
+
+
+def test_the_array_fits_the_target_along_either_axis() -> None:
+    camera = derive(described({"step": [4, 1], "pixels": "fit", "array": [3, 3]}, (20, 17)))
+    assert camera.types[0].pixels == ((20 - 8) // 3, (17 - 2) // 3)
+    assert camera.types[0].span == (20, 17)
 
 
 def test_patches_that_a_window_moves_onto_each_other_are_refused() -> None:

@@ -15,7 +15,7 @@ from ommatid.scenes.scene import read, with_changes, write
 from ommatid.scenes.tables import glass
 from ommatid.scenes.tables.camera import Surface
 
-from ..examples import GALLERY
+from ..examples import GALLERY, not_none
 
 LENS = """VERS 140124
 MODE SEQ
@@ -175,10 +175,17 @@ def agf(**glasses: tuple[int, tuple[float, ...]]) -> str:
     return text
 
 
+def dispersion(
+    formula: int, coefficients: tuple[float, ...], shortest: str = "300 nm", longest: str = "2 um"
+) -> Dispersion:
+    table = {"formula": formula, "coefficients": coefficients, "shortest": shortest, "longest": longest}
+    return Dispersion.model_validate(table)
+
+
 @pytest.mark.parametrize("name", MATERIALS)
 def test_formulas_yield_the_known_indices(name: str) -> None:
     formula = int(name.split()[0])
-    material = Dispersion(formula=formula, coefficients=MATERIALS[name], shortest="200 nm", longest="11 um")  # type: ignore[arg-type]
+    material = dispersion(formula, MATERIALS[name], "200 nm", "11 um")
     for wavelength, index in KNOWN[name].items():
         assert material.index(wavelength * 1e-3) == pytest.approx(index, abs=1e-4 if formula in (3, 7) else 1e-5)
 
@@ -205,10 +212,7 @@ SAME = {
         (7, (2.2, 0.012, 0.01)),
     ],
     "three poles": [(2, (1.2, 0.01, 0.3, 0.02, 0.5, 90)), (6, (0.3, 0.02, 0.5, 90, 0, 0, 1.2, 0.01))],
-    "last poles": [
-        (6, (0, 0, 0.3, 0.02, 0.5, 90, 1.2, 0.01)),
-        (11, (0.3, 0.02, 0, 0, 0.5, 90, 0, 0, 1.2, 0.01)),
-    ],
+    "last poles": [(6, (0, 0, 0.3, 0.02, 0.5, 90, 1.2, 0.01)), (11, (0.3, 0.02, 0, 0, 0.5, 90, 0, 0, 1.2, 0.01))],
     "two poles": [(9, (2.2, 0.3, 0.02, 0.4, 0.03)), (11, (0.3, 0.02, 0.4, 0.03, 1.2, 0))],
     "a pole without w": [(4, (0.2, 1.1, 0.15, 0.02, 0.1)), (9, (-0.8, 1.1, 0.0225, 2.0, 0.01))],
     "a square": [(8, (2.2, 0.3, 0.02, 0.01)), (7, (2.5, 0.3 * 0.02, 0.02, 0.01))],
@@ -219,10 +223,7 @@ SAME = {
 @pytest.mark.parametrize("name", SAME)
 def test_formulas_that_are_one_function_agree(name: str) -> None:
     for wavelength in (0.4e-3, 0.55e-3, 0.8e-3, 1.6e-3):
-        indices = [
-            Dispersion(formula=formula, coefficients=coefficients, shortest="300 nm", longest="2 um").index(wavelength)  # type: ignore[arg-type]
-            for formula, coefficients in SAME[name]
-        ]
+        indices = [dispersion(*each).index(wavelength) for each in SAME[name]]
         assert indices[1:] == pytest.approx([indices[0]] * (len(indices) - 1), rel=1e-12)
 
 
@@ -233,8 +234,7 @@ def test_the_rest_of_the_formulas_by_hand() -> None:
         (12, (2.2, 0, 0, 0, 0, 0, 0, 0.001), 2.264**0.5),
         (3, (1.5, 0.02, 0.03, 0.004, 0.0005, 0.00006), 1.5 + 0.005035246727 + 0.001901529 + 0.016 + 0.008 + 0.00384),
     ):
-        found = Dispersion(formula=formula, coefficients=coefficients, shortest="300 nm", longest="2 um")  # type: ignore[arg-type]
-        assert found.index(2e-3) == pytest.approx(index, abs=1e-8)
+        assert dispersion(formula, coefficients).index(2e-3) == pytest.approx(index, abs=1e-8)
 
 
 def test_a_scene_takes_glasses_from_a_catalogue(tmp_path: Path) -> None:
@@ -262,8 +262,7 @@ def test_a_scene_takes_glasses_from_a_catalogue(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=words.replace("less", "(?:less|.*)")):
             with_changes(data, tmp_path / "scene.toml", (), ())
     (tmp_path / "lens.zmx").write_text(LENS.format(unit="MM").replace("PMMA", "N-BK7"), encoding="utf-8")
-    surfaces = with_changes(data, tmp_path / "scene.toml", (), ()).camera.lens[0].surfaces
-    assert surfaces is not None
+    surfaces = not_none(with_changes(data, tmp_path / "scene.toml", (), ()).camera.lens[0].surfaces)
     assert isinstance(surfaces[1], Surface)
     assert glass.index_behind(surfaces[1]) == 1.7
 
@@ -272,17 +271,16 @@ def test_zemax_s_names_of_the_built_in_glasses(tmp_path: Path) -> None:
     (tmp_path / "lens.zmx").write_text(LENS.format(unit="MM").replace("PMMA", "F_SILICA"), encoding="utf-8")
     data = read(GALLERY / "tile19.toml", (), ["I"]).plain()
     data["camera"]["lens"][0]["surfaces"] = "lens.zmx"
-    surfaces = with_changes(data, tmp_path / "scene.toml", (), ()).camera.lens[0].surfaces
-    assert surfaces is not None
+    surfaces = not_none(with_changes(data, tmp_path / "scene.toml", (), ()).camera.lens[0].surfaces)
     assert isinstance(surfaces[1], Surface)
     assert surfaces[1].glass == "fused silica"
 
 
 def test_a_wavelength_outside_the_catalogue_s_range_is_refused() -> None:
-    material = Dispersion(formula=2, coefficients=(1.2, 0.01), shortest="400 nm", longest="1 um")  # type: ignore[arg-type]
+    material = dispersion(2, (1.2, 0.01), "400 nm", "1 um")
     for wavelength in (399e-6, 1001e-6):
         with pytest.raises(InputError, match="the index of X is known from 400 to 1000 nm"):
             material.index(wavelength, "X")
     for pole in (0.3025, 0.30250001):
         with pytest.raises(InputError, match="yield an index"):
-            Dispersion(formula=2, coefficients=(1.2, pole), shortest="400 nm", longest="1 um").index(550e-6)  # type: ignore[arg-type]
+            dispersion(2, (1.2, pole)).index(550e-6)

@@ -44,9 +44,7 @@ def disparity(camera: Camera, depth: FloatArray | float) -> dict[str, FloatArray
     return {name: offset * stretch for name, offset in lens_offsets(camera).items()}
 
 
-def error_by_depth(
-    camera: Camera, depth: FloatArray, error: FloatArray, variance: FloatArray, bins: int = BINS
-) -> tuple[DepthBin, ...]:
+def error_by_depth(camera: Camera, depth: FloatArray, error: FloatArray, variance: FloatArray) -> tuple[DepthBin, ...]:
     """Return the error of an estimate by distance, nearest first.
 
     depth, error, variance : (rows, columns) distances in mm, NaN where there is no surface; estimate minus truth; its
@@ -55,17 +53,17 @@ def error_by_depth(
     """
     if not depth.shape == error.shape == variance.shape:
         raise ValueError(f"expected maps of one shape, got {depth.shape}, {error.shape} and {variance.shape}")
-    return tuple(_bin(camera, depth[chosen], error[chosen], variance[chosen]) for chosen in _masks(depth, bins))
+    return tuple(_bin(camera, depth[chosen], error[chosen], variance[chosen]) for chosen in _masks(depth))
 
 
-def _masks(depth: FloatArray, bins: int) -> list[BoolArray]:
+def _masks(depth: FloatArray) -> list[BoolArray]:
     """Return the pixels of each bin, those without a surface last; none is empty."""
     empty = ~np.isfinite(depth)
     masks: list[BoolArray] = []
     if not empty.all():
         inverse = 1 / depth[~empty]
         low, high = float(inverse.min()), float(inverse.max())
-        count = 1 if high - low <= FLAT * high else bins
+        count = 1 if high - low <= FLAT * high else BINS
         index = np.full(depth.shape, -1)
         scaled = (high - inverse) / max(high - low, FLAT * high) * count
         index[~empty] = np.clip(scaled.astype(np.int64), 0, count - 1)

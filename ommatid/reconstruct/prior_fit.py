@@ -36,6 +36,7 @@ from scipy import fft, linalg
 from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import one_thread, processors
+from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables.estimation import PriorTable
 
@@ -264,9 +265,8 @@ class _PartMeans(_Picture):
 
 def means_over(image: FloatArray, side: int) -> FloatArray:
     """Return means over side x side pixels, without what is left at the far ends: (rows, columns)."""
-    rows, columns = (size // side for size in image.shape)
-    kept = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
-    return np.asarray(kept.mean(axis=(1, 3)), dtype=np.float64)
+    rows, columns = (size - size % side for size in image.shape)
+    return averaged(image[:rows, :columns], side)
 
 
 def _unknowns(task: EstimationTask) -> Model:

@@ -75,6 +75,13 @@ class Problem:
             if not np.isfinite(values).all():
                 raise InputError(f"expected finite values in {name}, got infinite ones or NaN")
 
+    def check(self, recorded: FloatArray, numbers: NDArray[np.intp] | slice = slice(None)) -> None:
+        """Raise InputError unless there are M measurements, and those of `numbers` are finite."""
+        if recorded.shape != (self.measurements,) or not np.isfinite(recorded[numbers]).all():
+            raise InputError(
+                f"expected {self.measurements} finite measurements, got others; leave dead pixels out first"
+            )
+
     @property
     def measurements(self) -> int:
         """M, the number of measurements."""

@@ -86,10 +86,7 @@ def estimate(
     before : an estimate from other measurements with the same H, prior and noise, whose form is tried first
     Raises InputError for values that are not finite, if memory does not suffice, or if no form reaches `tolerance`.
     """
-    if recorded.shape != (problem.measurements,) or not np.isfinite(recorded).all():
-        raise InputError(
-            f"expected {problem.measurements} finite measurements, got others; leave dead pixels out first"
-        )
+    problem.check(recorded)
     residuals = ExactResiduals(problem) if before is None else before.residuals
     form, solver, refined = _by_form_of(before, tolerance, recorded) or _certified(residuals, tolerance, recorded)
     multipliers = refined.multipliers[:, 0]

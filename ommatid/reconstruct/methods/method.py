@@ -22,6 +22,7 @@ from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.execution.workers import Workers
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.fitted.fitted_matrix import Directions
+from ommatid.scenes.formats.picture import averaged
 from ommatid.scenes.model import Model
 from ommatid.scenes.tables import estimation
 
@@ -202,10 +203,7 @@ class EstimationTask:
 
     def of_f(self, image: FloatArray) -> FloatArray:
         """Return the averages A w over pixels of f: (unknowns,) to (N,)."""
-        if self.finer == 1:
-            return image
-        rows, columns = self.shape_of_f
-        return image.reshape(rows, self.finer, columns, self.finer).mean(axis=(1, 3)).ravel()
+        return averaged(image.reshape(self.shape), self.finer).ravel()
 
     def of_unknowns(self, weights: FloatArray) -> FloatArray:
         """Return A^T c, the weights of the unknowns in a weighted sum of pixels of f: (N,) to (unknowns,)."""

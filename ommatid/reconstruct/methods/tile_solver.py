@@ -132,7 +132,9 @@ def _inside(problem: Problem, pixels: Indices) -> BoolArray:
 
 def _updated(before: Posterior, problem: Problem, recorded: FloatArray, numbers: Indices) -> Posterior:
     """Return the posterior after the measurements `numbers`, by the equations of the module docstring."""
-    _check_measurements(problem, recorded, numbers)
+    problem.check(recorded, numbers)
+    if not (problem.noise_variance[numbers] > 0).all():
+        raise InputError("merging tiles needs measurements with noise only; set estimator.noise_variance above 0")
     if not numbers.size:
         return before
     rows = sparse.csr_array(problem.matrix[numbers][:, before.pixels])
@@ -152,15 +154,6 @@ def _updated(before: Posterior, problem: Problem, recorded: FloatArray, numbers:
             "the noise is too small relative to the prior or the measurements for double precision; raise it"
         )
     return after
-
-
-def _check_measurements(problem: Problem, recorded: FloatArray, numbers: Indices) -> None:
-    if recorded.shape != (problem.measurements,) or not np.isfinite(recorded[numbers]).all():
-        raise InputError(
-            f"expected {problem.measurements} finite measurements, got others; leave dead pixels out first"
-        )
-    if not (problem.noise_variance[numbers] > 0).all():
-        raise InputError("merging tiles needs measurements with noise only; set estimator.noise_variance above 0")
 
 
 @dataclass(frozen=True)

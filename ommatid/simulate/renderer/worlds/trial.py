@@ -92,10 +92,7 @@ def _reason(task: dict[str, Any], where: str, seconds: float) -> str | None:
 def _death(code: int) -> str:
     if code >= 0:
         return f"Mitsuba's process ended with code {code}"
-    try:
-        return f"Mitsuba's process died of signal {-code} ({signal.Signals(-code).name})"
-    except ValueError:
-        return f"Mitsuba's process died of signal {-code}"
+    return f"Mitsuba's process died of signal {-code} ({signal.strsignal(-code)})"
 
 
 def _shown(at: str) -> str:

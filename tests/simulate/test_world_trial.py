@@ -22,7 +22,7 @@ from ommatid.simulate.renderer.worlds.checked_world import CheckedWorld, check_w
 from .world_files import world
 
 ENDS = {
-    "signal": r"^w: Mitsuba's process died of signal 11 \(Segmentation fault\) while it built the file cup.ply; correct or remove",
+    "signal": r"^w: Mitsuba's process died of signal 11 \(Segmentation fault\) while it built the file cup.ply",
     "code": r"^w: Mitsuba's process ended with code 3 while it built the file cup.ply; correct or remove it$",
     "hang": r"^w: Mitsuba takes longer than 1 s to build the file cup.ply; make it smaller$",
     "memory": r"^w needs more memory than the \S+ GB that are free; make it smaller$",

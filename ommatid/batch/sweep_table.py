@@ -154,7 +154,10 @@ def write_figure(path: Path, rows: Sequence[SweepRow], files: FigureFiles = SCRE
     curves = Curves.of(rows)
     figure = new_figure(10, 6, layout="constrained")
     panel, looks = figure.subplots(), curves.looks
-    shown = {key: [_numbers(row, curves.position(row)) for row in own] for key, own in curves.rows.items()}
+    shown = {
+        key: [_numbers(row, curves.position(row)) for row in sorted(own, key=curves.position)]
+        for key, own in curves.rows.items()
+    }
     _label_axes(panel, rows, curves.axis, [row for own in shown.values() for row in own])
     for key, own in shown.items():
         _draw_curve(panel, own, **looks[key])

@@ -119,7 +119,7 @@ class Measurement:
         """Take notice of a row of the study, and of the time that one of the journal took."""
         if FAILED not in row:
             cell = self.read(row)
-            self._start -= 0.0 if new else cell.seconds * cell.repeats
+            self._start -= 0.0 if new else cell.spent
             self._last[cell.stage, cell.way, cell.variant or ""] = cell.samples or 1, cell.seconds * cell.repeats
         self._progress(min(1.0, self.seconds / self._budget))
 
@@ -136,7 +136,7 @@ class Measurement:
             if repeats and self.seconds > self._budget:
                 raise InputError(LATE)
             repeats.append(self._work(setting, len(repeats)))
-        return cell_of(setting, repeats).model_dump()
+        return cell_of(setting, repeats).model_dump() | {"spent": perf_counter() - start}
 
 
 def cell_of(setting: Setting, repeats: list[Repeat]) -> Cell:

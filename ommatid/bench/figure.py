@@ -113,6 +113,7 @@ def _draw_way(panel: Any, cells: Sequence[Cell], style: Style, axes: tuple[str, 
     """
     (x, y), least = axes, _least(every, axes[1])
     rows = [cell.model_dump() for cell in cells if getattr(cell, x) is not None and (getattr(cell, y) or 0.0) > 0]
+    rows.sort(key=lambda row: row["samples"] or 0)
     draw_curve(panel, [row for row in rows if row["samples"] and row["setting"] != AUTO], x, y, **style)
     for row in rows:
         if row["samples"] and row["setting"] != AUTO:

@@ -70,6 +70,7 @@ class Cell(Setting):
     memory : peak memory of the process in bytes, None where the system does not report it
     mse : mean squared error of the image with this setting, the scene's noise, and the other stages exact
     scatter : standard deviation of the natural logarithm of the error over repeats, None for a single repeat
+    spent : seconds of all repeats and their errors, which only the journal of a bench keeps
     """
 
     repeats: int
@@ -85,6 +86,7 @@ class Cell(Setting):
     mse_low: float | None
     mse_high: float | None
     scatter: float | None = None
+    spent: float = Field(0.0, exclude=True)
 
 
 class ConvergenceCurve(_Record):

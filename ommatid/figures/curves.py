@@ -23,14 +23,13 @@ def cycled(number: int, values: Sequence[str]) -> str:
 
 
 def draw_curve(axes: Any, rows: Iterable[Row], x: str, y: str, **style: Any) -> None:
-    """Draw column `y` of rows against column `x`, with bars where the rows have `y`_low and `y`_high.
+    """Draw column `y` of rows, in their order, against column `x`, with bars where they have `y`_low and `y`_high.
 
     Rows without either number are left out, and on a logarithmic axis those of 0, which are no points there. NaN is a
     gap in the curve.
     """
     least = 0.0 if axes.get_yscale() == "log" else -inf
     known = [row for row in rows if row.get(x) is not None and row.get(y) is not None and not row[y] <= least]
-    known.sort(key=lambda row: row[x])
     if not known:  # which Matplotlib warns of on a logarithmic axis
         return
     across, values = ([row[name] for row in known] for name in (x, y))

@@ -33,15 +33,14 @@ def paper(
     from ommatid.paper.paper import rows, write_paper
 
     if which == "multiscale":
+        title = "Expected errors by pixels of several sizes"
         with output.progress_bar("paper") as progress:
-            errors = multiscale.write_multiscale(folder, progress)
-        output.print_result(errors, [("Expected errors by pixels of several sizes", multiscale.rows(errors))], as_json)
-        return
-
-    figures = options.figure_files(formats)
-    with output.progress_bar("paper") as progress:
-        description = write_paper(folder, image, seed, progress, figures)
-    output.print_result(description, [(f"The paper's claims: {folder / 'index.html'}", rows(description))], as_json)
+            description = multiscale.write_multiscale(folder, progress)
+    else:
+        title, figures = f"The paper's claims: {folder / 'index.html'}", options.figure_files(formats)
+        with output.progress_bar("paper") as progress:
+            description = write_paper(folder, image, seed, progress, figures)
+    output.print_result(description, [(title, rows(description))], as_json)
 
 
 def stability(

@@ -8,6 +8,7 @@ from the edges is a mean over waves. Along one dimension they are the waves that
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from fractions import Fraction
 from itertools import combinations
 from math import gcd
@@ -58,18 +59,8 @@ def write_multiscale(folder: Path, progress: Progress) -> dict[str, Any]:
     hidden = is_deficient((2, 3)) and not any(is_deficient(sizes) for sizes in SQUARES)
     claims.append(Claim("two sizes leave a null space in two dimensions", YES if hidden else "no", {}, source=SOURCE))
     write_rows(folder / CLAIMS, [claim.row for claim in claims])
-    described = [{"claim": each.claim, "holds": each.holds, "numbers": each.numbers} for each in claims]
+    described = [asdict(claim) for claim in claims]
     return {"folder": str(folder), "files": [CLAIMS], "claims": described, "seconds": perf_counter() - started}
-
-
-def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the lines of the printed table: each camera with its error and the published one."""
-    lines: list[tuple[str, str]] = []
-    for claim in summary["claims"]:
-        numbers = claim["numbers"]
-        found = f"{numbers['computed']:.5g}, published {numbers['published']:.5g}" if numbers else claim["holds"]
-        lines.append((claim["claim"], found))
-    return [*lines, ("seconds", f"{summary['seconds']:.1f}")]
 
 
 def _far_from_edges(mean: Callable[[FloatArray], float], sizes: Sequence[int], binning: str) -> float:
@@ -107,7 +98,8 @@ def is_deficient(sizes: Sequence[int]) -> bool:
 
 def _claim(name: str, found: float, published: float) -> Claim:
     holds = YES if abs(found / published - 1) <= CLOSE else "no"
-    return Claim(name, holds, {"computed": found, "published": published}, source=SOURCE)
+    remark = f"{found:.5g}, published {published:.5g}"
+    return Claim(name, holds, {"computed": found, "published": published}, remark, SOURCE)
 
 
 def _words(sizes: Sequence[int]) -> str:

@@ -21,7 +21,7 @@ from ommatid.scenes.scene import read
 from ommatid.scenes.tables.gallery import GALLERY
 
 from . import figures
-from .claims import CLAIMS, PAPER, Claim, error_claims, photograph_claims, rank_claims
+from .claims import CLAIMS, OWN, PAPER, Claim, error_claims, photograph_claims, rank_claims
 from .figures import RECONSTRUCTION_NOISE, Shown
 from .photographs import PHOTOGRAPH, Photograph, crop_tiles, load, reconstructed, simulate_trials
 from .tile_errors import COMBINATIONS, THREE, Tiles, distortion, tiles, whole_frame
@@ -119,7 +119,7 @@ def rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     lines: list[tuple[str, str]] = []
     for claim in summary["claims"]:
         remark = f": {claim['remark']}" if claim["remark"] else ""
-        own = "" if claim["source"] == PAPER else "not in the paper, "
+        own = "not in the paper, " if claim["source"] == OWN else ""
         lines.append((claim["claim"], own + claim["holds"] + remark))
     return [
         *lines,

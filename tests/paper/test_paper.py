@@ -450,7 +450,7 @@ def test_an_image_too_small_for_six_tiles_is_refused() -> None:
 def test_unreadable_images_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     (tmp_path / "note.npy").write_text("no picture", encoding="utf-8")
     np.save(tmp_path / "small.npy", np.zeros((60, 60)))
-    for name, expected in (("note.npy", "could not be read"), ("none.png", "no picture"), ("small.npy", "6 tiles")):
+    for name, expected in (("note.npy", "could not be read"), ("none.png", "No such file"), ("small.npy", "6 tiles")):
         with pytest.raises(InputError, match=f"--image.*{expected}") as refused:
             paper.write_paper(tmp_path / "out", str(tmp_path / name))
         assert "\n" not in str(refused.value)

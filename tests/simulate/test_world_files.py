@@ -36,7 +36,8 @@ def including(*names: str) -> str:
 
 
 def cycle(length: int) -> dict[str, str | bytes]:
-    return {"world.xml": including("0.xml")} | {f"{i}.xml": including(f"{(i + 1) % length}.xml") for i in range(length)}
+    files = {f"{i}.xml": including(f"{(i + 1) % length}.xml") for i in range(length)}
+    return {"world.xml": including("0.xml"), **files}
 
 
 ENTITIES = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10 if i else "ha"}">' for i in LAUGHS)

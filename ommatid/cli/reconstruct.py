@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +21,9 @@ if TYPE_CHECKING:
     from ommatid.figures.saving import FigureFiles
     from ommatid.reconstruct.output.run_json import RunReport
     from ommatid.runtime.execution.cluster import Cluster
+
+    # A frame with its report, or None with the reason of its failure and the exit code.
+    FrameResult = tuple[Frame, RunReport | None, str, int]
 
 StackAndModel = Annotated[
     list[Path],
@@ -185,67 +187,48 @@ def _reconstruct_many(
         missing = "name a stack before it" if common.model.suffix == ".npz" else "name its model, model.npz, after it"
         raise InputError(f"{common.model}: expected stacks and then their model, got one file; {missing}")
     check_own_page(folder / INDEX)
-    described: dict[Path, DescribedFrame] = {}
+    ended: dict[Path, FrameResult] = {}
     with output.progress_bar("reconstruct", quiet=detail == "verdict") as progress:
         for frame, work in reconstruct_frames(stacks, folder, common, workers, progress):
-            described[frame.stack] = _described(frame, work, quiet=detail == "verdict")
-    frames = [described[stack] for stack in stacks]
-    index, shown = finish_film(folder, [(each.frame, each.report, each.failure) for each in frames], common)
+            try:
+                report, made = work()
+            except Exception as error:
+                ended[frame.stack] = frame, None, printable_sentence(error), failures.report(error)
+                continue
+            ended[frame.stack] = frame, report, "", 0
+            if detail != "verdict":
+                output.say_done("reconstruct", made, frame.output)
+    frames = [ended[stack] for stack in stacks]
+    index, shown = finish_film(folder, [(frame, report, failure) for frame, report, failure, _ in frames], common)
     if detail != "verdict":
         output.say(f"film: {shown}; {index}" if shown else f"{index}: written")
     _print_frames(folder, frames, detail)
-    doubted = strict and not all(each.report is None or each.report.verdict.trusted for each in frames)
-    worst = max(failures.NOT_TRUSTED if doubted else 0, *(each.code for each in frames))
+    doubted = strict and not all(report is None or report.verdict.trusted for _, report, *_ in frames)
+    worst = max(failures.NOT_TRUSTED if doubted else 0, *(code for *_, code in frames))
     if worst:
         raise failures.BatchError(worst)
 
 
-@dataclass(frozen=True)
-class DescribedFrame:
-    """A frame with its report, or the reason of its failure and the exit code."""
-
-    frame: Frame
-    report: RunReport | None
-    failure: str = ""
-    code: int = 0
-
-
-def _print_frames(folder: Path, frames: Sequence[DescribedFrame], detail: output.Detail | None) -> None:
+def _print_frames(folder: Path, frames: Sequence[FrameResult], detail: output.Detail | None) -> None:
     from ommatid.reconstruct.output import facts
 
-    finished = [(each.frame.output.name, each.report) for each in frames if each.report is not None]
+    finished = [(frame.output.name, report) for frame, report, *_ in frames if report is not None]
     if detail is None:
-        output.print_json([_document(each) for each in frames])
+        documents: list[dict[str, Any]] = []
+        for frame, report, failure, code in frames:
+            content = {"error": failure, "exit_code": code} if report is None else report.plain()
+            documents.append({"file": str(frame.output), "stack": str(frame.stack), **content})
+        output.print_json(documents)
     elif detail == "verdict":
         output.print_lines(facts.verdict_line(*pair) for pair in finished)
     elif detail == "table":
         output.print_tables((name, facts.rows(report)) for name, report in finished)
     else:
         rows = [
-            (each.frame.output.name, f"failed: {each.failure}")
-            if each.report is None
-            else facts.frame_row(each.frame.output.name, each.report)
-            for each in frames
+            (frame.output.name, f"failed: {failure}") if report is None else facts.frame_row(frame.output.name, report)
+            for frame, report, failure, _ in frames
         ]
         output.print_tables([(f"{len(frames)} frames: {folder}", rows)])
-
-
-def _document(described: DescribedFrame) -> dict[str, Any]:
-    heading = {"file": str(described.frame.output), "stack": str(described.frame.stack)}
-    if described.report is None:
-        return {**heading, "error": described.failure, "exit_code": described.code}
-    return {**heading, **described.report.plain()}
-
-
-def _described(frame: Frame, work: Callable[[], tuple[RunReport, bool]], quiet: bool) -> DescribedFrame:
-    """Finish a frame, and say so."""
-    try:
-        report, made = work()
-    except Exception as error:
-        return DescribedFrame(frame, None, printable_sentence(error), failures.report(error))
-    if not quiet:
-        output.say_done("reconstruct", made, frame.output)
-    return DescribedFrame(frame, report)
 
 
 def report(

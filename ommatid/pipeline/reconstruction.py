@@ -176,13 +176,12 @@ def _design_warnings(folder: Path) -> tuple[str, ...]:
 
 def _write_page(folder: Path) -> None:
     """Write the page of a finished run. Raises InputError if its files are of several runs."""
-    report = run_json.read(folder)
-    recorded, calibrated = stack_file.read(folder / STACK), model_file.read(folder / MODEL)
-    regions = [(region.corner, region.size) for region in report.regions]
-    truth = result_files.truth_beside(folder / STACK, recorded)
-    if report.fingerprint != result_files.fingerprint_of(recorded, calibrated, truth, regions):
+    results = StageResults.read(folder)
+    regions = [(region.corner, region.size) for region in results.report.regions]
+    truth = result_files.truth_beside(folder / STACK, results.stack)
+    if results.report.fingerprint != result_files.fingerprint_of(results.stack, results.model, truth, regions):
         raise InputError(f"{folder}: run.json is of another stack or model than those beside it; run the scene again")
-    write_page(StageResults(report, recorded, calibrated), folder, SILENT)
+    write_page(results, folder, SILENT)
 
 
 @dataclass(frozen=True)

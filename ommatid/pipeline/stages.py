@@ -20,6 +20,8 @@ from ommatid.runtime.machine import one_thread
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
+from ommatid.scenes import model_file
+from ommatid.scenes import stack as stack_file
 from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
@@ -39,6 +41,11 @@ class StageResults:
     report: RunReport
     stack: Stack
     model: Model
+
+    @classmethod
+    def read(cls, folder: Path) -> StageResults:
+        """Read those of a finished run. Raises InputError."""
+        return cls(run_json.read(folder), stack_file.read(folder / "stack.exr"), model_file.read(folder / "model.npz"))
 
 
 def open_scene(path: Path, changes: Sequence[str] = (), lenses: Sequence[str] = ()) -> Setup:
@@ -101,7 +108,6 @@ def write_figures(folder: Path, figures: FigureFiles) -> None:
     from ommatid.analysis.depth_error import PICTURE, draw
     from ommatid.reconstruct.output.overview import write_overview
     from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
-    from ommatid.scenes import stack as stack_file
 
     report, stack = run_json.read(folder), stack_file.read(folder / "stack.exr")
     write_overview(folder, stack, read_estimate(folder / ESTIMATE).channels, report, figures)
@@ -117,16 +123,16 @@ def add_baselines(folder: Path, progress: Progress) -> RunReport:
     from ommatid.analysis.baselines import cached_baselines
     from ommatid.batch.remote import SILENT
     from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
-    from ommatid.scenes import model_file, stack
 
-    report, truth = run_json.read(folder), read_estimate(folder / ESTIMATE).channels.get("truth")
+    truth = read_estimate(folder / ESTIMATE).channels.get("truth")
     if truth is None:
         raise InputError(f"{folder}: --baselines compares with the truth, which is not known here; leave it out")
-    files = stack.read(folder / "stack.exr"), model_file.read(folder / "model.npz")
+    results = StageResults.read(folder)
+    report, files = results.report, (results.stack, results.model)
     found = cached_baselines(folder, report.fingerprint, *files, truth.astype("float64"), progress)
-    if found.reports != report.baselines:
-        report = finish(StageResults(report.with_changes(baselines=found.reports), *files), folder, SILENT)
-    return report
+    if found.reports == report.baselines:
+        return report
+    return finish(replace(results, report=report.with_changes(baselines=found.reports)), folder, SILENT)
 
 
 def check_run(setup: Setup, folder: Path) -> None:

@@ -17,7 +17,7 @@ from .run_json import (
     SolverReport,
     StageReport,
 )
-from .verdict_words import causes, error_words, grounds, heading, limit
+from .verdict_words import causes, grounds, heading, limit
 
 UNDETERMINED = 5.0  # deviation of the logarithm of a fitted number that may be anything
 METHODS = {
@@ -101,15 +101,10 @@ def summary_lines(name: str, report: RunReport, page: Path | None) -> list[str]:
 
 def frame_row(name: str, report: RunReport) -> tuple[str, str]:
     """Return the name of a frame of many, and its verdict, error and time in words."""
-    error, difference = report.error, report.diagnostics.noise_difference
-    words = [heading(report), f"expected error {error_words(error.predicted_mse)}"]
-    words += [] if error.mse is None else [f"measured {error_words(error.mse)}"]
-    words.append(f"{report.stages['reconstruct'].seconds:.2f} s")
-    if difference is None:
-        words.append("error bars computed")
-    else:
-        words.append("error bars of an earlier frame" + (f", noise within {difference:.1g}" if difference else ""))
-    return name, ", ".join(words)
+    shared = [fact.words for fact in _diagnostics(report.diagnostics) if fact.name == "error bars"]
+    return name, ", ".join(
+        [heading(report), headline(report), f"{report.stages['reconstruct'].seconds:.2f} s", *shared]
+    )
 
 
 def agreement(error: ErrorReport) -> Literal["agrees", "worse", "better", "unknown"]:
@@ -271,6 +266,9 @@ def _diagnostics(diagnostics: DiagnosticsReport) -> list[Fact]:
     if diagnostics.pixels_saturated:
         reach = f"{diagnostics.pixels_saturated}, known to reach the limit"
         found.append(Fact("saturated sensor pixels", reach, topic="caution"))
+    if diagnostics.noise_difference is not None:
+        within = f"noise within {diagnostics.noise_difference:.1g}" if diagnostics.noise_difference else ""
+        found.append(Fact("error bars", "error bars of an earlier frame", within))
     residual = diagnostics.chi_squared
     if residual is not None:
         expected = f"expected {residual.expected:.4g} +/- {residual.deviation:.2g}"

@@ -84,7 +84,7 @@ CASES: dict[str, tuple[Callable[[], Scene], float]] = {  # and the accuracy of e
 def test_estimate_error_bars_and_regions(name: str) -> None:
     """Of a dark picture whose pixels vary much less than the prior's where the level is unknown, else of a draw."""
     scene, accuracy = CASES[name][0](), CASES[name][1]
-    shape, rng = scene.target.shape, np.random.default_rng(1)
+    shape, rng = derive(scene).shape, np.random.default_rng(1)
     draw = 127.5 + coloured(spectrum_of(scene.prior, shape, 1.0), rng.normal(size=shape)).ravel()
     picture = 12 + 5 * rng.random(draw.size) if scene.prior.level_deviation else draw
     stack, (gain, covariance) = recorded(scene, picture, not_none(scene.noise).variance), dense(scene)

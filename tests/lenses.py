@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,13 @@ BICONVEX = [
 ]
 
 
+# So thin that closed forms of thin lenses hold, at f/13.
+THIN = [
+    {"radius": "2 mm", "thickness": "1 um", "index": 1.5, "semi_diameter": "75 um"},
+    {"radius": "-2 mm", "semi_diameter": "75 um"},
+]
+
+
 def lens(
     radius: list[float],
     thickness: list[float],
@@ -61,9 +69,9 @@ def ball(radius: float = 1.0, index: float = 1.5) -> Prescription:
     return lens([radius, -radius], [2 * radius], [index, 1.0], radius)
 
 
-def camera_with(surfaces: Any, **more: Any) -> Camera:
-    """Return the camera of the paper's tile with these lenses of type I, and room for them."""
-    data = read(GALLERY / "tile19.toml", (), ["I"]).plain()
+def camera_with(surfaces: Any, changes: Sequence[str] = (), **more: Any) -> Camera:
+    """Return the camera of the paper's tile, with changes, with these lenses of type I, and room for them."""
+    data = read(GALLERY / "tile19.toml", changes, ["I"]).plain()
     data["camera"]["lens"][0] |= {"surfaces": surfaces, **more}
     data["camera"]["lens_pitch"] = "1 mm"
     return derive(parse(data, Path("test.toml")))

@@ -18,12 +18,11 @@ STEP = 1e-6  # of differences of slopes
 
 @dataclass(frozen=True)
 class Aperture:
-    """The field of a sensor point on the stop: points (3, n), optical paths, strengths, and radii, 1 at the rim."""
+    """The field of a sensor point on the stop: points (3, n), optical paths and strengths."""
 
     points: np.ndarray
     paths: np.ndarray
     strengths: np.ndarray
-    radii: np.ndarray
 
 
 def _traced(lens: Prescription, height: float, sensor: float, slopes: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -79,7 +78,7 @@ def aperture_of(lens: Prescription, depth: float, height: float, rings: int = 40
     tilt = 2 * _sag(lens, 0, point[0] ** 2 + point[1] ** 2)[1] * point[:2]
     through = np.abs(direction[2] - (tilt * direction[:2]).sum(axis=0))  # light's cosine times surface per area
     light = 1 / (1 + (slopes**2).sum(axis=0)) ** 2 / np.abs(grown) * area
-    return Aperture(point, path, np.sqrt(light * through * area), np.hypot(*wanted) / rim)
+    return Aperture(point, path, np.sqrt(light * through * area))
 
 
 _STEPS = STEP * np.array([[[1.0], [0.0]], [[0.0], [1.0]]])
@@ -103,9 +102,3 @@ def relative_light(
         wave = aperture.strengths / away * np.exp(2j * np.pi / wavelength * (path - path[0]))
         found.append(abs(wave.sum()) ** 2 / (aperture.strengths / away).sum() ** 2)
     return np.array(found)
-
-
-def aberration(lens: Prescription, distance: float, aperture: Aperture, wavelength: float) -> np.polynomial.Polynomial:
-    """Return the waves of aberration of the sensor's middle, as a polynomial of the squared radius on the stop."""
-    waves = (aperture.paths + _distances(lens, distance, aperture, 0.0)) / wavelength
-    return np.polynomial.Polynomial.fit(aperture.radii**2, waves - waves.mean(), 5, domain=[0, 1], window=[0, 1])

@@ -33,7 +33,7 @@ from ommatid.scenes.scene import read
 from ommatid.simulate.ideal import ideal_matrix
 
 from ..examples import GALLERY, needs
-from ..lenses import BICONVEX, DOUBLE_GAUSS, ball, camera_with, lens, turned_round
+from ..lenses import BICONVEX, DOUBLE_GAUSS, THIN, ball, camera_with, lens, turned_round
 
 Array = NDArray[np.float64]
 
@@ -48,13 +48,6 @@ def straight(lens: Prescription, height: Any) -> tuple[Array, Array, Any]:
     assert not np.any(y)
     assert not np.any(v)
     return x, u / w, passed
-
-
-def crossing(lens: Prescription, height: Any) -> Array:
-    """Return the distance in front of the first vertex at which such rays cross the axis."""
-    x, slope, passed = straight(lens, height)
-    assert np.all(passed)
-    return -x / slope
 
 
 def double_gauss(tmp_path: Any) -> Prescription:
@@ -85,19 +78,6 @@ def test_snell_s_law_holds_at_a_sphere(radius: float, index: float, x: float, y:
     np.testing.assert_allclose(index * np.cross(start, normal), np.cross(out, normal), atol=1e-12)
 
 
-def test_a_plane_parallel_plate_shifts_a_ray() -> None:
-    """By t sin(a) (1 - cos(a) / sqrt(n^2 - sin(a)^2)) across it, and turns it by nothing."""
-    angle, thickness, index = np.linspace(-1.4, 1.4, 9), 0.7, 1.6
-    planes = [(0.0, 0.0, 1.0, 1 / index, inf), (thickness, 0.0, 1.0, index, inf)]
-    (x, _), (u, _, w), passed, _ = through(
-        planes, (0 * angle, 0 * angle), (np.sin(angle), 0 * angle, np.cos(angle)), NUMPY, True
-    )
-    assert np.all(passed)
-    shift = thickness * np.sin(angle) * (1 - np.cos(angle) / np.sqrt(index**2 - np.sin(angle) ** 2))
-    np.testing.assert_allclose(np.cos(angle) * (thickness * np.tan(angle) - x), shift, atol=1e-14)
-    np.testing.assert_allclose((u, w), (np.sin(angle), np.cos(angle)), atol=1e-14)
-
-
 def test_total_reflection_and_rims_block_and_leave_numbers() -> None:
     """From glass of index 1.5 nothing leaves beyond asin(1 / 1.5) = 41.8 degrees."""
     angle = np.radians([41.0, 42.0, 80.0])
@@ -110,36 +90,6 @@ def test_total_reflection_and_rims_block_and_leave_numbers() -> None:
         assert np.all(direction[2][1:] == 1)
     x = np.array([0.0, 0.99, 1.01, 50.0])
     assert list(straight(ball(1.0), x)[2]) == [True, True, False, False]
-
-
-def test_an_axial_point_and_one_beside_it_have_the_paraxial_images() -> None:
-    """Through a narrow pupil: in the conjugate plane, upside down, times the ratio of the distances."""
-    for one in (ball(), lens([1.5, -4.0, inf, 1.1, -3.0], [0.3, 0.2, 0.3, 0.4], [1.7, 1.0, 1.0, 1.6, 1.0], stop=2)):
-        distance = 50.0
-        depth = 1 / (1 / one.focal_length - 1 / distance)
-        across, down = 1e-3 * np.array([-1.0, 0.0, 1.0, 0.0]), 1e-3 * np.array([0.0, 1.0, 0.0, 0.0])
-        numbers = path(one, Disk(0.0, 1.0))
-        (x, y), (u, v, w), _, _ = trace(numbers, 1e-4, 0.0, across, down, depth)
-        np.testing.assert_allclose(x + distance * u / w, -1e-4 * distance / depth, rtol=1e-4)
-        np.testing.assert_allclose(y + distance * v / w, 0, atol=1e-6)
-
-
-@pytest.mark.parametrize("curved_first", [True, False])
-def test_spherical_aberration_of_a_plano_convex_lens(curved_first: bool) -> None:
-    """Third order, in both orientations: F. Jenkins, H. White, Fundamentals of Optics, chapter 9, a far point,
-
-    1/s_h - 1/s_p = h^2 / (8 f^3 n (n-1)) ((n+2)/(n-1) q^2 - 4 (n+1) q + (3n+2)(n-1) + n^3/(n-1)).
-    """
-    index, focal_length, height = 1.5, 10.0, 0.1
-    radius = (index - 1) * focal_length
-    # rays come from the sensor's side, which the last surface faces
-    one = lens([inf, -radius], [1e-6], [index, 1.0]) if curved_first else lens([radius, inf], [1e-6], [index, 1.0])
-    q = 1 if curved_first else -1
-    brackets = (index + 2) / (index - 1) * q**2 - 4 * (index + 1) * q + (3 * index + 2) * (index - 1)
-    brackets += index**3 / (index - 1)
-    shift = height**2 / (8 * focal_length**3 * index * (index - 1)) * brackets
-    assert 1 / crossing(one, height) - 1 / focal_length == pytest.approx(shift, rel=2e-3)
-    assert shift * focal_length**3 / height**2 == pytest.approx(7 / 6 if curved_first else 4.5)
 
 
 def test_the_disk_holds_every_ray_that_passes(tmp_path: Any) -> None:
@@ -193,12 +143,7 @@ def test_a_camera_s_lenses_collect_what_their_f_numbers_say() -> None:
     for lens_type in camera.types:
         angle = optics_of(camera, lens_type, None).weight(np.zeros(1))[0]
         assert angle == pytest.approx(pi / (4 * reported[lens_type.name] ** 2), rel=0.015)
-    data = [
-        'target.distance="20 mm"',
-        'camera.lens.I.surfaces=[{radius="2 mm", thickness="1 um", index=1.5, semi_diameter="75 um"},'
-        ' {radius="-2 mm", semi_diameter="75 um"}]',
-    ]
-    camera = derive(read(GALLERY / "tile19.toml", data, ["I"]))
+    camera = camera_with(THIN, ['target.distance="20 mm"'])
     field = optics_of(camera, camera.types[0], None)
     height = np.linspace(0, field.field, 9)
     assert field.field / field.depth > 0.4
@@ -237,11 +182,7 @@ def test_numpy_and_dr_jit_agree_to_float32() -> None:
 
 def test_a_thin_real_lens_diffracts_as_a_thin_lens() -> None:
     """H in closed form by traced waves against that of the thin lens, by other formulas."""
-    rows = [
-        {"radius": "2 mm", "thickness": "1 um", "index": 1.5, "semi_diameter": "75 um"},
-        {"radius": "-2 mm", "semi_diameter": "75 um"},
-    ]
-    camera = camera_with(rows)
+    camera = camera_with(THIN)
     real = camera.types[0]
     thin = replace(real, optics=LensOptics(aperture=0.15 * camera.focal_length(real) / 2))
     found, expected = (ideal_matrix(replace(camera, types=(kind,))).toarray() for kind in (real, thin))
@@ -283,12 +224,8 @@ def test_depth_of_field_ends_where_the_thin_lens_blurs_over_a_pixel() -> None:
 
 def test_a_thin_real_lens_is_reported_as_a_thin_lens() -> None:
     """Biconvex, thickness next to nothing, out of focus: only its spherical aberration stays, at f/13 small."""
-    rows = [
-        {"radius": "2 mm", "thickness": "1 um", "index": 1.5, "semi_diameter": "75 um"},
-        {"radius": "-2 mm", "semi_diameter": "75 um"},
-    ]
-    (real,) = sharpness.describe(camera_with(rows, focus="100 mm"))
-    camera = camera_with(rows, focus="100 mm")
+    (real,) = sharpness.describe(camera_with(THIN, focus="100 mm"))
+    camera = camera_with(THIN, focus="100 mm")
     diameter = 0.15 * camera.focal_length(camera.types[0]) / 2
     data = [f'camera.lens.I.aperture="{diameter} mm"', 'camera.lens.I.focus="100 mm"']
     (ideal,) = sharpness.describe(derive(read(GALLERY / "tile19.toml", data, ["I"])))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +12,10 @@ from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.optics import sharpness
 from ommatid.scenes.optics.field import optics_of
 from ommatid.scenes.optics.point_spread import point_spread
-from ommatid.scenes.scene import parse, read
+from ommatid.scenes.scene import read
 
 from ..examples import GALLERY
+from ..lenses import THIN, camera_with
 
 LARGE = ("camera.lens_pitch=1 mm", "target.shape=[185, 185]", "target.origin=[0, 0]", "camera.lens.I.pixels=[61, 61]")
 
@@ -73,13 +72,7 @@ def test_the_field_of_a_thin_single_lens_is_curved_as_the_third_order_says() -> 
 
     The distance of the image does not matter to the third order but by h, the height on the image.
     """
-    rows: list[dict[str, Any]] = [
-        {"radius": "2 mm", "thickness": "1 um", "index": 1.5, "semi_diameter": "75 um"},
-        {"radius": "-2 mm", "semi_diameter": "75 um"},
-    ]
-    data = read(GALLERY / "tile19.toml", LARGE, ["I"]).plain()
-    data["camera"]["lens"][0]["surfaces"] = rows
-    camera = derive(parse(data, Path("test.toml")))
+    camera = camera_with(THIN, LARGE)
     (found,) = sharpness.describe(camera)
     field = optics_of(camera, camera.types[0], None)
     expected = -(field.field**2) / (2 * field.focal_length) * (2 + 1 / 1.5)

@@ -33,32 +33,30 @@ MOVED = {"tolerance": {"position": "1 um"}}
 RAYS = 1024
 
 
+def multinomial(matrix: sparse.csr_array, rng: np.random.Generator, passes: int, rays: int) -> Responses:
+    """Entries from independent rays: a multinomial draw for each row and pass, with the light beside the target."""
+    shares = np.maximum(matrix.toarray(), 0.0)
+    shares = np.column_stack([shares, np.maximum(1 - shares.sum(axis=1), 0.0)])
+    shares /= shares.sum(axis=1, keepdims=True)
+    drawn = rng.multinomial(rays, shares, size=(passes, len(shares)))[..., :-1] / rays
+    mean = sparse.csr_array(drawn.mean(axis=0))
+    at = np.repeat(np.arange(len(shares)), np.diff(mean.indptr)), mean.indices
+    batches = drawn.reshape(passes // BATCHES, BATCHES, *mean.shape).mean(axis=0)[:, *at] - mean.data
+    variance = drawn[:, *at].var(axis=0, ddof=1) / passes
+    return Responses(Plan(passes, rays), {}, mean, variance, batches.astype(np.float32))
+
+
 def drawn(cam: Camera, matrix: sparse.csr_array, rays: int, seed: int) -> FittedCalibration:
-    """Return the calibration by independent rays of an H: every row of every pass is a multinomial draw."""
-    rng, each = np.random.default_rng(seed), rays // FEWEST_PASSES
+    """Return the calibration by independent rays of an H."""
+    rng = np.random.default_rng(seed)
 
     def measure(subsets: Subsets) -> Responses:
-        dense = np.zeros(matrix.shape)
+        kept = np.zeros((matrix.shape[0], 1))
         for lens, rows in zip(cam.types, cam.type_slices(), strict=True):
             if lens.name in subsets:
                 pixels = subsets[lens.name]
-                chosen = np.arange(rows.start, rows.stop)[slice(None) if pixels is None else pixels]
-                dense[chosen] = matrix[chosen].toarray()
-        lost = np.where(dense.any(axis=1), np.maximum(1 - dense.sum(axis=1), 0), 1.0)
-        shares = np.column_stack([dense, lost])
-        shares /= shares.sum(axis=1, keepdims=True)
-        passes = rng.multinomial(each, shares, size=(FEWEST_PASSES, len(shares)))[:, :, :-1] / each
-        mean = passes.mean(axis=0)
-        found = sparse.csr_array(mean)
-        at = np.repeat(np.arange(mean.shape[0]), np.diff(found.indptr)), found.indices
-        batches = passes.reshape(FEWEST_PASSES // BATCHES, BATCHES, *mean.shape).mean(axis=0)
-        return Responses(
-            work=Plan(FEWEST_PASSES, each),
-            record={},
-            matrix=found,
-            variance=passes[:, at[0], at[1]].var(axis=0, ddof=1) / FEWEST_PASSES,
-            batches=(batches[:, at[0], at[1]] - found.data).astype(np.float32),
-        )
+                kept[np.arange(rows.start, rows.stop)[slice(None) if pixels is None else pixels]] = 1
+        return multinomial(sparse.csr_array(matrix * kept), rng, FEWEST_PASSES, rays // FEWEST_PASSES)
 
     names = [lens.name for lens in cam.types]
     return calibrate_by_fit(cam, measure, lambda responses: responses.variance, dict.fromkeys(names, rays))

@@ -17,25 +17,17 @@ from ommatid.scenes.tables.camera import ToleranceTable
 from ommatid.simulate.calibration.fit.kernel_fit import KernelFit, fit_kernels, refusal
 from ommatid.simulate.calibration.responses import Responses
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.sampling.passes import Plan
-from tests.examples import with_optics
+
+from ..examples import with_optics
+from .test_fit import multinomial
 
 PASSES, RAYS = 16, 256
 ONE = (("1/3", [3, 3], [5, 5]),)
 
 
 def drawn(matrix: sparse.csr_array, rng: np.random.Generator, rays: int = RAYS) -> Responses:
-    """Entries from independent rays: a multinomial draw for each row and pass, with the light beside the target."""
-    rows, columns = matrix.shape
-    shares = np.maximum(matrix.toarray(), 0.0)
-    shares = np.concatenate([shares, np.maximum(1 - shares.sum(axis=1, keepdims=True), 0.0)], axis=1)
-    shares /= shares.sum(axis=1, keepdims=True)
-    passes = rng.multinomial(rays, shares, size=(PASSES, rows))[..., :columns] / rays
-    mean = sparse.csr_array(passes.mean(axis=0))
-    at = np.repeat(np.arange(rows), np.diff(mean.indptr)), mean.indices
-    batches = passes.reshape(2, 8, rows, columns).mean(axis=0)[:, *at] - mean.data
-    variance = passes[:, *at].var(axis=0, ddof=1) / PASSES
-    return Responses(Plan(PASSES, rays), {}, mean, variance, batches.astype(np.float32))
+    """Entries from independent rays."""
+    return multinomial(matrix, rng, PASSES, rays)
 
 
 def defocused(lenses: tuple[tuple[object, object, object], ...] = ONE) -> Camera:

@@ -32,31 +32,22 @@ def llvm(monkeypatch: pytest.MonkeyPatch) -> Any:
     return claim
 
 
-@pytest.mark.parametrize("version", [(15, 0, 7), (16, 0, 6)])
-def test_a_broken_llvm_is_not_chosen(llvm: Any, version: tuple[int, int, int]) -> None:
-    llvm(version)
-    assert choose("auto") == "scalar_rgb"
-    with pytest.raises(InputError, match=rf"LLVM {version[0]}.*run: |LLVM {version[0]}.*install"):
-        choose("llvm_ad_mono")
-
-
-def test_no_llvm_at_all(llvm: Any) -> None:
-    llvm(None)
-    assert choose("auto") == "scalar_rgb"
-    assert "no usable LLVM" in unusable_reason("llvm_ad_mono")
-
-
-def test_a_good_llvm_is_chosen(llvm: Any) -> None:
-    llvm((19, 1, 7))
-    assert choose("auto") == "llvm_ad_mono"
-
-
-def test_an_unknown_version_is_not_chosen(llvm: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_a_good_llvm_is_chosen(llvm: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     import drjit as dr
 
     llvm((19, 1, 7))
-    monkeypatch.delattr(dr.detail, "llvm_version")
+    assert choose("auto") == "llvm_ad_mono"
+    for version in ((15, 0, 7), (16, 0, 6)):
+        llvm(version)
+        assert choose("auto") == "scalar_rgb"
+        with pytest.raises(InputError, match=rf"LLVM {version[0]}.*run: |LLVM {version[0]}.*install"):
+            choose("llvm_ad_mono")
+    llvm(None)
     assert choose("auto") == "scalar_rgb"
+    assert "no usable LLVM" in unusable_reason("llvm_ad_mono")
+    llvm((19, 1, 7))
+    monkeypatch.delattr(dr.detail, "llvm_version")
+    assert choose("auto") == "scalar_rgb", "of an unknown version"
 
 
 @pytest.mark.skipif(not BROKEN, reason="no LLVM 15 or 16 on this machine")
@@ -85,19 +76,13 @@ def test_without_llvm_nothing_foreign_is_on_the_error_stream(here: Path, monkeyp
     assert ended.stderr == "another line\nkept"
 
 
-def test_a_failed_probe_is_reported_as_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(variant, "_PROBE", "import os; os.abort()")
-    assert "trial rendering failed" in probe("llvm_ad_mono").reason
-
-
-def test_the_working_backend_renders_in_its_probe() -> None:
+def test_a_probe_renders_or_says_why_not_with_one_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     assert probe("scalar_rgb").speed > 0
-
-
-def test_the_remedy_is_one_command() -> None:
     slow = [BackendStatus("llvm_ad_mono", "none", 0), BackendStatus("scalar_rgb", "", 1e6)]
     assert "slow" in diagnosis(slow)
     assert "nothing to repair" in diagnosis([BackendStatus("llvm_ad_mono", "", 1e7)])
+    monkeypatch.setattr(variant, "_PROBE", "import os; os.abort()")
+    assert "trial rendering failed" in probe("llvm_ad_mono").reason
 
 
 def test_a_library_that_mitsuba_does_not_find_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from ommatid.simulate.sampling.passes import Rendering
 
 from ..examples import SLOW_SCALAR, VARIANTS, assert_student, needs
 from ..examples import scene as flat_scene
-from .world_files import FAST, THIRDS, Z, cube, floored, glow, rectangle, world
+from .world_files import FAST, LETTER, THIRDS, Z, cube, floored, glow, rectangle, world
 
 CHECKS = (
     '<emitter type="area"><texture type="checkerboard" name="radiance"><float name="color0" value="1.6"/>'
@@ -110,10 +110,6 @@ def test_a_ball_occludes_the_background(tmp_path: Path, variant: str) -> None:
     np.testing.assert_allclose(found.image[clear], 0.2 * 255, rtol=1e-4)
     assert (np.abs(found.depth[inside] - z) <= radius).all()
     np.testing.assert_allclose(found.depth[clear], 1500, rtol=1e-6)
-
-
-LETTER = np.zeros((12, 12), dtype=bool)
-LETTER[2:10, 3] = LETTER[2, 3:8] = LETTER[5, 3:6] = True
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -276,40 +272,59 @@ def test_a_changed_world_or_file_of_it_is_rendered_again(tmp_path: Path) -> None
     assert keep() == (pytest.approx(255 / 2), True)
 
 
+LIGHT = r"expected readings of 0 to 1e\+15, .*, got"
+
+
 def shape_at(change: str, value: str) -> str:
     where = f'<transform name="to_world"><{change} z="{value}"/></transform>'
     return f'<emitter type="constant"/><shape type="cube" id="far">{where}</shape>'
 
 
+SKY, FROM_FILE = '<emitter type="constant"/>', {"camera": "from file"}
+SENSOR = '<sensor type="perspective"><transform name="to_world"><scale x="SCALE"/></transform></sensor>'
+CHANNELS = SKY + '<integrator type="INTEGRATOR<integrator type="path"/></integrator>'
+
+
 @pytest.mark.parametrize(
-    ("content", "complaint"),
+    ("content", "table", "complaint"),
     [
-        ('<shape type="sphere"><float name="weight" value="1"/></shape>', "unreferenced property"),
-        ('<shape type="sphere"/>', "has no emitter"),
-        (shape_at("translate", "1e400"), "finite positions, got shape 'far' from -1, -1, inf to"),
-        (shape_at("scale", "nan"), "finite positions, got shape 'far' from -1, -1, nan to"),
-        ('<emitter type="constant"/><integrator type="ptracer"/>', "does not follow rays from a camera"),
+        ('<shape type="sphere"><float name="weight" value="1"/></shape>', {}, "unreferenced property"),
+        ('<shape type="sphere"/>', {}, "has no emitter"),
+        (shape_at("translate", "1e400"), {}, "finite positions, got shape 'far' from -1, -1, inf to"),
+        (shape_at("scale", "nan"), {}, "finite positions, got shape 'far' from -1, -1, nan to"),
+        (SKY + '<integrator type="ptracer"/>', {}, "does not follow rays from a camera"),
+        *(
+            (CHANNELS.replace("INTEGRATOR", kind), {}, r"returns \d+ more channels \(.*\); expected the radiance alone")
+            for kind in ('aov"><string name="aovs" value="a:depth"/>', 'moment">')
+        ),
+        (SKY, FROM_FILE, "expected one sensor, got 0; add one"),
+        (SKY + 2 * SENSOR.replace("SCALE", "1"), FROM_FILE, "expected one sensor, got 2; leave one"),
+        (
+            SKY + '<sensor type="radiancemeter"/>',
+            FROM_FILE,
+            "expected one with a to_world, got a 'radiancemeter' without",
+        ),
+        (SKY + SENSOR.replace("SCALE", "2"), FROM_FILE, "got one that shears or stretches"),
+        *(
+            (rectangle(4, 4, 0, 0, Z, glow(radiance)) + rectangle(40, 40, 0, 0, 2 * Z, glow(1)), {}, LIGHT)
+            for radiance in ("nan", "inf", "-1", "1e30")
+        ),
     ],
 )
-def test_a_world_that_cannot_be_built_is_refused(tmp_path: Path, content: str, complaint: str) -> None:
-    described, camera = world(tmp_path, content, variant="scalar_rgb")
-    with pytest.raises(InputError, match=complaint) as told:
-        truth(Setup(described, camera))
-    text = str(told.value)
-    assert text.startswith("test.toml: world.file: ")
-    assert "\n" not in text
-    assert ".cpp" not in text
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("radiance", ["nan", "inf", "-1", "1e30"])
-def test_light_that_is_none_is_refused(tmp_path: Path, variant: str, radiance: str) -> None:
-    needs(variant)
-    content = rectangle(4, 4, 0, 0, Z, glow(radiance)) + rectangle(40, 40, 0, 0, 2 * Z, glow(1))
-    described, camera = world(tmp_path, content, variant=variant)
-    for make in (light, truth):
-        with pytest.raises(InputError, match=r"^test.toml: world.file: .*: expected readings of 0 to 1e\+15, .*, got"):
-            make(Setup(described, camera))
+def test_a_world_that_cannot_be_rendered_is_refused(
+    tmp_path: Path, content: str, table: dict[str, str], complaint: str
+) -> None:
+    """In one sentence, by both backends where light is none."""
+    for variant in VARIANTS if complaint == LIGHT else VARIANTS[:1]:
+        needs(variant)
+        described, camera = world(tmp_path, content, variant=variant, world=table)
+        for make in (truth, light) if complaint == LIGHT else (truth,):
+            with pytest.raises(InputError, match=complaint) as told:
+                make(Setup(described, camera))
+            text = str(told.value)
+            assert text.startswith("test.toml: world.file: ")
+            assert "\n" not in text
+            assert ".cpp" not in text
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -320,7 +335,7 @@ def test_bright_worlds_and_signed_pictures_are_rendered(tmp_path: Path, variant:
     if variant.startswith("scalar"):
         return  # where Mitsuba's films take no negative light
     picture = {"image": "photo:camera", "origin": [96, 224]}
-    described, camera = world(tmp_path, '<emitter type="constant"/>', target=picture, variant=variant)
+    described, camera = world(tmp_path, SKY, target=picture, variant=variant)
     image = np.random.default_rng(1).normal(size=camera.shape)
     assert light(Setup(described, camera, image)).mean.min() < 0
 

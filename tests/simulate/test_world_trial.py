@@ -85,19 +85,6 @@ def test_pictures_and_volumes_that_are_none_or_too_large_are_refused_in_one_sent
 
 
 @pytest.mark.parametrize(
-    "integrator",
-    ['<integrator type="aov"><string name="aovs" value="a:depth"/>', '<integrator type="moment">'],
-)
-def test_integrators_of_more_channels_are_refused(tmp_path: Path, integrator: str) -> None:
-    content = f'<emitter type="constant"/>{integrator}<integrator type="path"/></integrator>'
-    described, camera = world(tmp_path, content, variant="scalar_rgb")
-    with pytest.raises(
-        InputError, match=r"its integrator returns \d+ more channels \(.*\); expected the radiance alone"
-    ):
-        truth(Setup(described, camera))
-
-
-@pytest.mark.parametrize(
     ("most", "sure", "endless"), [(-1, 20_000, True), (20_000, 30_000, True), (-1, 5, False), (20, 10**9, False)]
 )
 def test_paths_that_may_be_endless_are_refused(most: int, sure: int, endless: bool, tmp_path: Path) -> None:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 Z = 1000.0
 FAST = "llvm_ad_mono"
+LETTER = np.zeros((12, 12), dtype=bool)  # F
+LETTER[2:10, 3] = LETTER[2, 3:8] = LETTER[5, 3:6] = True
 THIRDS: Lenses = (("1/3", [3, 3], [3, 3]), ("1/4", [2, 2], [2, 2]))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,27 +72,40 @@ def numbers(description: dict[str, Any]) -> dict[str, Any]:
 
 def without_times(record: dict[str, Any]) -> dict[str, Any]:
     """A record without seconds, and without the fingerprints and hashes that depend on them."""
-    return {key: value for key, value in record.items() if key not in ("seconds", "fingerprint", "sha256")}
+    kept = {key: value for key, value in record.items() if key not in ("seconds", "fingerprint", "sha256", "seal")}
+    if "report" in kept:
+        kept["report"] = numbers(kept["report"])
+    return kept | ({"record": without_times(kept["record"])} if "record" in kept else {})
 
 
 def content(folder: Path) -> dict[str, Any]:
-    """Everything in the files of a run that does not depend on the time it took."""
-    found: dict[str, Any] = {"run.json": numbers(json.loads((folder / "run.json").read_text(encoding="utf-8")))}
-    for path in folder.glob("*.exr"):
-        for part in exr.read(path):
-            record = {**part.record, "record": without_times(part.record.get("record", {}))}
-            record |= {"report": numbers(record["report"])} if "report" in record else {}
-            found[f"{path.name}/{part.name}"] = without_times(record)
-            found |= {f"{path.name}/{part.name}/{name}": pixels.tobytes() for name, pixels in part.channels.items()}
-    with np.load(folder / "model.npz", allow_pickle=False) as file:
-        found |= {name: (file[name].dtype, file[name].tobytes()) for name in file.files if name != "ommatid"}
-    found["model"] = without_times(model_file.read(folder / "model.npz").record)
-    # The pictures show no times, and so are equal byte for byte.
-    return found | {name: (folder / name).read_bytes() for name in ("scene.toml", "estimate.png", "overview.png")}
+    """Everything in the files below a folder that does not depend on the time it took, but for pages and tables."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("[!.]*")):
+        name = path.relative_to(folder).as_posix()
+        if path.name == "run.json":
+            found[name] = numbers(json.loads(path.read_text(encoding="utf-8")))
+        elif path.suffix == ".exr":
+            for part in exr.read(path):
+                found[f"{name}/{part.name}"] = without_times(part.record)
+                found |= {
+                    f"{name}/{part.name}/{channel}": pixels.tobytes() for channel, pixels in part.channels.items()
+                }
+        elif path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {each: (file[each].dtype, file[each].tobytes()) for each in file.files if each != "ommatid"}
+            found |= {f"{name}/{each}": array for each, array in arrays.items()}
+            found[name] = without_times(model_file.read(path).record)
+        elif path.suffix in (".png", ".toml"):  # pictures show no times, and so are equal byte for byte
+            found[name] = path.read_bytes()
+    return found
 
 
-def assert_same_content(folder: Path, expected: dict[str, Any]) -> None:
-    """The run in `folder` has the same content as `expected`; a failure names the parts that differ."""
-    found = content(folder)
-    assert found.keys() == expected.keys()
-    assert [name for name in found if found[name] != expected[name]] == []
+def differences(found: Mapping[str, Any], expected: Mapping[str, Any]) -> list[str]:
+    """Names of the parts of a content that differ, or that only one of two has."""
+    return sorted(name for name in {*found, *expected} if name not in found or found[name] != expected.get(name))
+
+
+def assert_same_content(folder: Path, expected: Mapping[str, Any]) -> None:
+    """The files of a run hold the same as others; a failure names the parts that differ."""
+    assert differences(content(folder), expected) == []

@@ -7,7 +7,6 @@ them. Everything else has to be equal bit for bit, and a finished stage keeps th
 from __future__ import annotations
 
 import csv
-import json
 import os
 import random
 import select
@@ -23,22 +22,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ommatid.page.cached import read_stamp
 from ommatid.reconstruct.output import run_json
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
 
 from ..conftest import TINY
-from ..runs import numbers, without_times
+from ..runs import content, differences
 
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 NOT_BEGUN = 99  # exit code of a process that is interrupted before its command
 MOST_KILLS = 6  # of one folder, before its commands may run to their end
 SCENES = ("a.toml", "b.toml", "c.toml")
 OUT, INPUTS = "out", "inputs"
-TIMED = "fingerprint", "sha256", "seal", "report"  # of records in EXR files
 STACK, MODEL = "stack.exr", "model.npz"
 BATCH = ("run", *SCENES, "-o", OUT)
 SWEEP = ("run", SCENES[0], "-o", OUT, "--sweep", "noise.variance=1e-3,1e-2", "--sweep", "render.seed=1,2")
@@ -169,7 +165,9 @@ def campaign(starter: subprocess.Popen[str], here: Path, name: str, kills: int, 
         shutil.rmtree(here / OUT)
         _fill(starter, here, commands, rng, seconds, tally)
         tally.folders += 1
-        tally.wrong += [f"{name}, folder {tally.folders}: {what}" for what in differences(here / OUT, expected)]
+        tally.wrong += [
+            f"{name}, folder {tally.folders}: {what} differs" for what in differences(results(here / OUT), expected)
+        ]
     shutil.rmtree(here / OUT)
     return tally
 
@@ -235,35 +233,14 @@ def finished_times(out: Path) -> dict[str, float]:
 
 def results(out: Path) -> dict[str, Any]:
     """Everything in an output folder that does not depend on the time it took."""
-    found: dict[str, Any] = {"names": sorted(str(path.relative_to(out)) for path in out.rglob("*"))}
-    for path in out.rglob("[!.]*"):
-        name = str(path.relative_to(out))
-        if path.suffix in (".png", ".toml"):
-            found[name] = path.read_bytes()
-        elif path.suffix == ".exr":
-            for part in exr.read(path):
-                kept = {key: value for key, value in part.record.items() if key not in TIMED}
-                kept["record"] = without_times(kept.get("record", {}))
-                found[f"{name}/{part.name}"] = kept, {key: value.tobytes() for key, value in part.channels.items()}
-        elif path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                found[name] = [(key, file[key].tobytes()) for key in file.files if key != "ommatid"]
-            found[f"{name}/record"] = without_times(model_file.read(path).record)
-        elif path.name == "run.json":
-            found[name] = numbers(json.loads(path.read_text(encoding="utf-8")))
-        elif path.name in ("report.html", "index.html"):
-            text = path.read_text(encoding="utf-8")
-            found[name] = read_stamp(path)[1] is not None, text.count("report.html"), text.count("<img")
-        elif path.name == "sweep.csv":
-            with path.open(encoding="utf-8", newline="") as stream:
-                found[name] = [{key: row[key] for key in row if "seconds" not in key} for row in csv.DictReader(stream)]
+    found: dict[str, Any] = {"names": sorted(str(path.relative_to(out)) for path in out.rglob("*")), **content(out)}
+    for path in (*out.rglob("report.html"), *out.glob("index.html")):
+        text = path.read_text(encoding="utf-8")
+        stamped = read_stamp(path)[1] is not None
+        found[str(path.relative_to(out))] = stamped, text.count("report.html"), text.count("<img")
+    for path in out.glob("sweep.csv"):
+        with path.open(encoding="utf-8", newline="") as stream:
+            found[path.name] = [
+                {key: row[key] for key in row if "seconds" not in key} for row in csv.DictReader(stream)
+            ]
     return found
-
-
-def differences(out: Path, expected: dict[str, Any]) -> list[str]:
-    """Name what differs from an undisturbed run."""
-    found = results(out)
-    if found["names"] != expected["names"]:
-        odd = set(found["names"]) ^ set(expected["names"])
-        return [f"files that only one of them has: {', '.join(sorted(odd))}"]
-    return [f"{name} differs" for name in expected if found.get(name) != expected[name]]

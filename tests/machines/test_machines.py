@@ -14,7 +14,8 @@ import pytest
 
 from ommatid.simulate.renderer.variant import unusable_reason
 
-from .variations import EVERYTHING, VARIATIONS, Variation, differences, result, run
+from ..runs import differences
+from .variations import EVERYTHING, VARIATIONS, Variation, result, run
 
 pytestmark = pytest.mark.slow
 

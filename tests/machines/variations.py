@@ -86,11 +86,6 @@ def result(folder: Path) -> dict[str, Any]:
     return {name: _plain(value) for name, value in content(folder).items()} | {"report.html": page}
 
 
-def differences(found: Mapping[str, Any], expected: Mapping[str, Any]) -> list[str]:
-    """Names of the parts of a result that differ."""
-    return sorted(name for name in {*found, *expected} if found.get(name) != expected.get(name))
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items() if key not in OF_THE_MACHINE}  # pyright: ignore

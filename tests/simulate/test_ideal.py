@@ -65,19 +65,6 @@ def test_overlaps_are_shares(ratio: Fraction, pixels: int, start: Fraction) -> N
     np.testing.assert_allclose(covered[inside], 1, rtol=1e-12)
 
 
-def test_a_ramp_reads_its_value_at_the_footprints_centre() -> None:
-    """A linear image averaged over a symmetric footprint is its value at the middle."""
-    one = camera()
-    rows, columns = np.indices((19, 19)) + 0.5
-    read = ideal_matrix(one) @ (2 * rows + 3 * columns).ravel()
-    expected: list[float] = []
-    for sub in one.sub_imagers:
-        i, j = np.indices(sub.type.pixels) + 0.5
-        m = float(sub.type.ratio)
-        expected.extend((2 * (float(sub.window[0]) + m * i) + 3 * (float(sub.window[1]) + m * j)).ravel())
-    np.testing.assert_allclose(read, expected, rtol=1e-12)
-
-
 @pytest.mark.parametrize("m", [2, 3, 4, 5])
 def test_null_space_of_one_type(m: int) -> None:
     """One type of m shifts leaves a = m - 1 unseen combinations along an axis: 2 a N - a^2 in the plane."""

@@ -7,7 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from .commands import COMMANDS, SLOW, ended, trapped_folder
+from .commands import COMMANDS, SLOW, ended, executed, trapped_folder
 
 
 def main() -> None:
@@ -23,13 +23,11 @@ def main() -> None:
                     code, messages, seconds = ended((name, *words), folder)
                 except subprocess.TimeoutExpired:
                     code, messages, seconds = -1, "hangs", -1.0
-                executed = sorted(mark.name for mark in marks.iterdir())
-                for mark in marks.iterdir():
-                    mark.unlink()
-                wrong = code != 0 or bool(executed)
+                found = executed(marks)
+                wrong = code != 0 or bool(found)
                 failures += wrong
                 line = f"{'WRONG' if wrong else 'right'}  {code:3}  {seconds:6.1f} s  {' '.join((name, *words))}"
-                print(line, *executed, *([messages[-400:]] if code else []), flush=True)
+                print(line, *found, *([messages[-400:]] if code else []), flush=True)
     sys.exit(failures > 0)
 
 

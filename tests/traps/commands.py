@@ -56,6 +56,14 @@ def trapped_folder(parent: Path) -> tuple[Path, Path, int]:
     return folder, marks, count
 
 
+def executed(marks: Path) -> list[str]:
+    """Return the names of the traps that left their marks, and remove these."""
+    found = sorted(marks.iterdir())
+    for mark in found:
+        mark.unlink()
+    return [mark.name for mark in found]
+
+
 def ended(words: tuple[str, ...], folder: Path) -> tuple[int, str, float]:
     """Run a command in a new process; return its exit code, its messages and its seconds."""
     script = shutil.which("ommatid", path=str(Path(sys.executable).parent))

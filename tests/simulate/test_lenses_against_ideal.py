@@ -88,7 +88,7 @@ def assert_scores(found: FloatArray, fewest: int = 200) -> None:
 @pytest.mark.parametrize("kind", [*CLOSED, *SURFACES])
 def test_traced_h_is_the_closed_form(kind: str) -> None:
     needs("llvm_ad_mono")
-    optics = (CLOSED | SURFACES)[kind]
+    optics: Any = (CLOSED | SURFACES)[kind]
     described, camera = with_optics(*optics, calibration={"samples": SAMPLES}, render=INDEPENDENT)
     traced = measured(Setup(described, camera), by_points=False)
     rays = float(traced.work.total)

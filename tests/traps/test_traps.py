@@ -45,17 +45,10 @@ def test_every_command_is_tried() -> None:
 def test_no_command_executes_anything_of_the_current_folder(trapped: tuple[Path, Path]) -> None:
     """All commands in one process, which the imports of a start are too long for otherwise."""
     folder, marks = trapped
-    environment: dict[str, Any] = {"env": {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "capture_output": True, "timeout": TIME_LIMIT}
     command = [sys.executable, "-P", "-c", IN_ONE_PROCESS, json.dumps(ALL), str(marks)]
-    process = subprocess.run(
-        command,
-        cwd=folder,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        timeout=TIME_LIMIT,
-        check=True,
-        **environment,
-    )
+    process = subprocess.run(command, cwd=folder, env=environment, check=True, **options)
     results = [json.loads(line) for line in process.stdout.splitlines()]
     assert [tuple(words) for words, *_ in results] == ALL
     assert [result for result in results if result[1] or result[3]] == []

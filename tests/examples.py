@@ -42,21 +42,22 @@ def scene(shape: tuple[int, int] = (19, 19), lenses: Lenses = (("1/3", [3, 3], [
 
     A calibrated H has entries, which most tests are about, unless `calibration` names another fit, and the numbers of
     samples are fixed unless `render` and `calibration` name others. Pixels are independent unless `prior` says more.
+    Keys of `target` and `camera` are added to those here.
     """
     calibration = {"samples": 256} | tables.get("calibration", {})
     if calibration.get("method") != "ideal":
         calibration = {"fit": "none"} | calibration
-    target = tables.pop("target", {})
     tables = tables | {"render": {"samples": 256} | tables.get("render", {}), "calibration": calibration}
     names = "ABCDEFGH"
     data: dict[str, Any] = {
+        **tables,
         "target": {
             "image": "photo:camera",
             "origin": [96, 224],
             "shape": list(shape),
             "pixel_pitch": "1 mm",
             "distance": "1 m",
-            **target,
+            **tables.get("target", {}),
         },
         "camera": {
             "pixel_pitch": "6 um",
@@ -65,8 +66,8 @@ def scene(shape: tuple[int, int] = (19, 19), lenses: Lenses = (("1/3", [3, 3], [
                 {"name": name, "magnification": magnification, "array": array, "pixels": pixels}
                 for name, (magnification, array, pixels) in zip(names, lenses, strict=False)
             ],
+            **tables.get("camera", {}),
         },
-        **tables,
         "prior": {"kind": "independent"} | tables.get("prior", {}),
     }
     return parse(data, Path("test.toml"))
@@ -97,7 +98,8 @@ def with_optics(
     **tables: Any,
 ) -> tuple[Scene, Camera]:
     """A scene with more keys in every lens type and in the table [camera], and its camera."""
-    data = scene(shape, lenses, **tables).plain()
+    sensor = {"sensor": tables.pop("sensor")} if "sensor" in tables else {}  # which pinholes do not have
+    data = scene(shape, lenses, **tables).plain() | sensor
     for table in data["camera"]["lens"]:
         table.update(lens)
     data["camera"].update(camera_table)

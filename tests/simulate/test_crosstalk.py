@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +9,11 @@ import pytest
 from scipy import stats
 
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.optics.negligible import skipped_effects
 from ommatid.scenes.optics.radiometry import electrons
 from ommatid.scenes.pose import corner_offset
-from ommatid.scenes.scene import Scene, parse, read
+from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import rendered_model
 from ommatid.simulate.ideal import ideal_matrix
@@ -24,11 +23,7 @@ from ..examples import GALLERY, familywise, mean_weights, needs, scene, with_opt
 
 FAST = "llvm_ad_mono"
 SMALL = (("1/3", [2, 2], [2, 2]), ("1/5", [2, 2], [1, 1]))
-OPEN = {
-    "walls": False,
-    "wavelength": "none",
-    "lens_pitch": "0.02 mm",
-}  # neighbours look at the target, too
+OPEN = {"walls": False, "wavelength": "none", "lens_pitch": "0.02 mm"}  # neighbours look at the target, too
 TRANSPORT = {"method": "transport", "samples": 16384}
 BATCHES = 16
 
@@ -94,10 +89,9 @@ def test_h_is_that_of_rays_through_every_lens() -> None:
 def test_electrons_and_weights_of_rays_count_every_lens(pitch: str) -> None:
     """The mean weight of a pixel's rays is its light over that of a lens on the axis."""
     needs(FAST)
-    data = open_camera("0.01 mm")[0].plain() | {"sensor": {"illuminance": "500 lux", "exposure": "10 ms"}}
-    data["camera"]["lens_pitch"] = pitch
-    described = parse(data, Path("test.toml"))
-    camera = derive(described)
+    sensor: dict[str, Any] = {"sensor": {"illuminance": "500 lux", "exposure": "10 ms"}, "calibration": TRANSPORT}
+    table = OPEN | {"lens_pitch": pitch}
+    described, camera = with_optics({"aperture": "0.01 mm"}, table, SMALL, (31, 31), **sensor)
     response = electrons(described, camera)
     renderer = Renderer(camera, FAST, together=False)
     for group in renderer.groups:
@@ -105,8 +99,8 @@ def test_electrons_and_weights_of_rays_count_every_lens(pitch: str) -> None:
         weights = mean_weights(renderer, group, 16384)
         ratio = response[rows] / weights
         np.testing.assert_allclose(ratio, ratio[0], rtol=2e-3)
-    closed = parse(data | {"camera": {**data["camera"], "walls": True}}, Path("test.toml"))
-    gained = response / electrons(closed, derive(closed))
+    closed = with_optics({"aperture": "0.01 mm"}, table | {"walls": True}, SMALL, (31, 31), **sensor)
+    gained = response / electrons(*closed)
     # Neighbours at 0.02 mm are next to the axis of lenses 1.2 and 2 mm before the sensor: all eight count nearly alike.
     if pitch == "0.02 mm":
         np.testing.assert_allclose(gained, 8, rtol=5e-3)
@@ -124,6 +118,6 @@ def test_walls_are_said_and_what_is_unclear_without_them_refused() -> None:
     with pytest.raises(InputError, match=r"expected calibration\.method 'transport', no fit, got 'points'"):
         open_camera(calibration={"method": "points"})
     with pytest.raises(InputError, match="add an aperture or keep the walls"):
-        parse(scene().plain() | {"camera": {**scene().plain()["camera"], "walls": False}}, Path("test.toml"))
+        scene(camera={"walls": False})
     with pytest.raises(InputError, match="walls = false needs thin lenses"):
         read(GALLERY / "doublet.toml", ["camera.walls=false"])

@@ -79,10 +79,7 @@ def test_the_open_third_of_a_pixel_is_the_middle_one_of_nine_pixels(name: str) -
     ("ratio", "part"), [("1/3", "2/3"), ("2/5", "1/2"), ("1/4", "7/10"), ("2/5", ["1/2", "1"]), ("1/4", ["1", "7/10"])]
 )
 def test_a_box_of_any_side_is_a_mean_of_points(ratio: str, part: Part) -> None:
-    described = scene((19, 19), ((ratio, [2, 2], [3, 3]),))
-    data = described.plain()
-    data["camera"]["fill_factor"] = part
-    camera = derive(parse(data, Path("test.toml")))
+    camera = derive(scene((19, 19), ((ratio, [2, 2], [3, 3]),), camera={"fill_factor": part}))
     (lens,), points = camera.types, (np.arange(2000) + 0.5) / 2000
     parts = [float(Fraction(each)) for each in (part if isinstance(part, list) else [part, part])]
     expected = np.zeros((2, 2, 3, 19))

@@ -18,13 +18,13 @@ from ommatid.scenes.formats.picture import load
 from ommatid.scenes.optics import sharpness
 from ommatid.scenes.optics.diffraction import pattern
 from ommatid.scenes.optics.radiometry import electrons
-from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.render import render
 from ommatid.simulate.renderer.plugins import export
 
-from ..examples import THREE, Lenses, mean_weights, needs, scene
+from ..examples import THREE, Lenses, mean_weights, needs, with_optics
 
 BIPLANE = [
     {"thickness": "5 mm", "semi_diameter": "0.1 mm"},  # a baffle, far before the lens
@@ -32,7 +32,7 @@ BIPLANE = [
     {"semi_diameter": "0.2 mm"},
 ]
 # With 1024 samples most of the error behind such wide lenses is that of H, which is stated too large: docs/coverage.md.
-MANY = {"method": "transport", "samples": 32768}
+MANY = {"method": "transport", "samples": 32768, "fit": "auto"}
 SENSOR = {"illuminance": "300 lux", "exposure": "10 ms", "read_noise": 3, "gain": 0.5, "black_level": 40, "prnu": 0.01}
 
 
@@ -40,12 +40,8 @@ def built(
     lens: dict[str, Any], lenses: Lenses = THREE, shape: tuple[int, int] = (19, 19), wavelength: str = "", **tables: Any
 ) -> Scene:
     """Return a scene whose lens types all have these keys, calibrated by transport."""
-    calibration = {"method": "transport", "samples": 1024}
-    data = scene(shape, lenses, render={"samples": 1024}, calibration=calibration).plain()
-    data["camera"] |= {"wavelength": wavelength} if wavelength else {}
-    for described in data["camera"]["lens"]:
-        described.update(lens)
-    return parse({**data, **tables}, Path("test.toml"))
+    few = {"render": {"samples": 1024}, "calibration": {"method": "transport", "samples": 1024}}
+    return with_optics(lens, {"wavelength": wavelength} if wavelength else {}, lenses, shape, **few | tables)[0]
 
 
 @pytest.mark.parametrize(

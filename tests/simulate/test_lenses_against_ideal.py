@@ -133,7 +133,8 @@ def test_the_focus_has_these_waves(kind: str) -> None:
 def test_rays_in_a_world_have_the_pattern_of_their_surface_s_distance(kind: str, samples: int) -> None:
     """Rays from points of the pupil that find the flat target's distance by themselves."""
     needs("llvm_ad_mono")
-    _, camera = with_optics(*(CLOSED | SURFACES).get(kind, ({"aperture": "0.4 mm"}, {})), render={"complete": True})
+    optics: Any = (CLOSED | SURFACES).get(kind, ({"aperture": "0.4 mm"}, {}))
+    _, camera = with_optics(*optics, render={"complete": True})
     expected = ideal_matrix(camera)[camera.type_slices()[0]]
     assert_scores(scores(traced_in_a_world(camera, samples), expected, samples))
 

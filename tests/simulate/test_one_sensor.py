@@ -16,7 +16,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.render import light
 
-from ..examples import SLOW_SCALAR, THREE, VARIANTS, assert_student, needs, scene
+from ..examples import SLOW_SCALAR, THREE, VARIANTS, assert_student, needs, with_optics
 from .world_files import Z, floored, glow, rectangle, world
 
 SENSOR = {"common": "sensor"}
@@ -25,12 +25,7 @@ NEAR = {"pixel_pitch": "6 um", "distance": "10 mm"}  # images on the sensor at 1
 
 def near(common: str = "sensor", lens: dict[str, Any] | None = None, **tables: Any) -> Setup:
     """A setup with three lens types close to the target, and more keys in every lens type."""
-    data = scene((19, 19), THREE, **tables).plain()
-    data["target"] |= NEAR
-    data["camera"]["common"] = common
-    for table in data["camera"]["lens"]:
-        table |= lens or {}
-    return Setup.from_scene(parse(data, Path("test.toml")))
+    return Setup(*with_optics(lens or {}, {"common": common}, THREE, target=NEAR, **tables))
 
 
 def test_the_lenses_of_all_types_stand_before_one_sensor_and_keep_their_magnifications() -> None:
@@ -115,8 +110,6 @@ def test_focal_lengths_before_one_sensor_give_the_magnifications() -> None:
 
 
 def test_channels_without_walls_need_lenses_in_one_plane() -> None:
-    data = near(lens={"aperture": "0.2 mm"}).scene.plain()
-    data["camera"]["walls"] = False
-    data["calibration"] |= {"method": "transport", "fit": "none"}
+    tables: dict[str, Any] = {"target": NEAR, "calibration": {"method": "transport"}}
     with pytest.raises(InputError, match="common"):
-        parse(data, Path("test.toml"))
+        with_optics({"aperture": "0.2 mm"}, {"common": "sensor", "walls": False}, THREE, **tables)

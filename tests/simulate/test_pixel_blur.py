@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,11 @@ from ommatid.analysis.summary import describe
 from ommatid.reconstruct.method_choice import choose_method
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
-from ommatid.scenes.camera import Camera, derive
+from ommatid.scenes.camera import Camera
 from ommatid.scenes.optics.lens_matrix import row_by_rays, row_by_waves
 from ommatid.scenes.optics.point_spread import point_spread
 from ommatid.scenes.optics.wavefront import thin_wavefront
-from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.scene import Scene
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.adaptive_render import render_until
 from ommatid.simulate.calibrate import calibrate
@@ -31,10 +30,9 @@ def blurred(name: str, part: Part = "1", detail: int = 1, distance: str = "1 m",
     """A camera whose pixels blur, on the grid of H's columns."""
     lens, table = OPTICS[name]
     optics = ROOM | table | BLUR | {"fill_factor": part}
-    data = with_optics(lens, optics, LENS, SHAPE, **tables)[0].plain()
-    data["target"] |= {"detail": detail, "distance": distance}
-    described = parse(data, Path("test.toml"))
-    return described, derive(described).with_grid_of_matrix
+    target = {"detail": detail, "distance": distance}
+    described, camera = with_optics(lens, optics, LENS, SHAPE, target=target, **tables)
+    return described, camera.with_grid_of_matrix
 
 
 def softened(ratio: float, start: float, size: int, deviation: float) -> FloatArray:

@@ -25,7 +25,7 @@ from ommatid.simulate.render import light
 from ommatid.simulate.sampling.passes import rounding_variance
 from ommatid.simulate.sampling.samplers import fitting
 
-from ..examples import SLOW_SCALAR, THREE, VARIANTS, assert_student, familywise, needs, scene
+from ..examples import SLOW_SCALAR, THREE, VARIANTS, assert_student, familywise, needs, scene, with_optics
 from .strata import corners
 from .world_files import LETTER, floored
 
@@ -192,10 +192,8 @@ def test_no_ray_is_assigned_to_another_sub_imager(variant: str) -> None:
     would be visible against the rounding of 256 equal values.
     """
     needs(variant)
-    data = scene((98, 98), ((1, [16, 16], [4, 4]),), render={"variant": variant, "samples": 4096}).plain()
-    data["camera"]["lens"][0]["step"] = 6
-    described = parse(data, Path("test.toml"))
-    camera = derive(described)
+    render = {"variant": variant, "samples": 4096}
+    described, camera = with_optics({"step": 6}, {}, ((1, [16, 16], [4, 4]),), (98, 98), render=render)
     assert camera.types[0].origin == (2, 2)
     blocks = np.random.default_rng(0).uniform(50.0, 250.0, (16, 16)).astype(np.float32).astype(np.float64)
     image = np.pad(np.kron(blocks, np.ones((6, 6))), 1, mode="edge").astype(np.float64)

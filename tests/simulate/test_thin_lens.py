@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ommatid.scenes.camera import derive
 from ommatid.scenes.pose import corner_offset, pose_of
-from ommatid.scenes.scene import parse
 from ommatid.simulate.renderer import lens as thin_lens
 from ommatid.simulate.renderer.variant import activate
 
-from ..examples import camera, mean_weights, needs, scene
+from ..examples import camera, mean_weights, needs, with_optics
 from .world_files import FAST
 
 PLACES = st.floats(-1, 1)
@@ -58,11 +54,9 @@ def test_rendered_light_follows_the_solid_angle() -> None:
     needs("llvm_ad_mono")
     from ommatid.simulate.renderer.renderer import Renderer
 
-    data = scene((100, 100), (("1/4", [1, 1], [25, 25]),)).plain()
-    data["target"]["pixel_pitch"] = "20 mm"  # so that the corner is seen at 45 degrees and more
-    data["camera"] |= {"pixel_pitch": "80 um", "lens_pitch": "9 mm"}
-    data["camera"]["lens"][0]["aperture"] = "40 um"
-    one = derive(parse(data, Path("test.toml")))
+    sizes = {"pixel_pitch": "80 um", "lens_pitch": "9 mm"}
+    target = {"pixel_pitch": "20 mm"}  # so that the corner is seen at 45 degrees and more
+    _, one = with_optics({"aperture": "40 um"}, sizes, (("1/4", [1, 1], [25, 25]),), (100, 100), target=target)
     found = mean_weights(Renderer(one, "llvm_ad_mono"), "A", 256).reshape(25, 25)
     away = (np.arange(25) - 12) * one.pixel_pitch / one.depth(one.types[0])
     cosine = 1 / np.sqrt(1 + away[:, None] ** 2 + away[None, :] ** 2)

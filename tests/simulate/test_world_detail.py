@@ -27,8 +27,8 @@ SMALL = (("1/3", [3, 3], [3, 3]), ("1/2", [2, 2], [5, 5]))
 
 def detailed(detail: int, **tables: object) -> Scene:
     """A distorted camera in front of a world `detail` times finer than 11 x 11 pixels of f."""
-    described, _ = with_optics({"distortion": [0.3, 0]}, {"lens_pitch": "3 mm"}, SMALL, (11, 11), **tables)
-    return described.model_copy(update={"target": described.target.model_copy(update={"detail": detail})})
+    target = {"detail": detail}
+    return with_optics({"distortion": [0.3, 0]}, {"lens_pitch": "3 mm"}, SMALL, (11, 11), target=target, **tables)[0]
 
 
 def test_pictures_are_used_at_their_own_resolution() -> None:

@@ -149,7 +149,7 @@ def save(name: str, pixels: Any) -> None:
     ("name", "pixels", "words"),
     [
         ("colour.png", np.full((12, 12, 3), 9, np.uint8), "is a colour picture"),
-        ("deep.png", np.full((12, 12), 9, np.uint16), "divided by 257"),
+        ("deep.png", np.full((12, 12), 9, np.uint16), "scaled from 65535 to the range from 0 to 255"),
         ("grey.png", np.full((12, 12), 9, np.uint8), ""),
     ],
 )

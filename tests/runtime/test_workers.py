@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -213,6 +213,29 @@ class IdleExecutor(Executor):
             future.cancel()
             future.set_running_or_notify_cancel()
         return future
+
+
+class DyingExecutor(Executor):
+    """Executes two tasks; its processes die when it is given a third."""
+
+    def __init__(self) -> None:
+        self.left = 2
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.left -= 1
+        if self.left < 0:
+            raise BrokenExecutor
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+def test_results_that_were_there_when_processes_died_are_not_lost() -> None:
+    """A process may die while the result before it is written."""
+    results = workers.Workers(DyingExecutor(), lambda: 3).each(digits, range(4))
+    assert [next(results)[1]() for _ in range(2)] == [digits(0), digits(1)]
+    with pytest.raises(MachineError, match="a process died"):
+        next(results)
 
 
 @pytest.mark.usefixtures("impatient")

@@ -70,7 +70,7 @@ class Workers:
         try:
             while True:
                 for index, item in islice(remaining, max(0, max(1, self._size()) - len(pending))):
-                    pending[self._executor.submit(function, item)] = index
+                    pending[self._submitted(function, item)] = index
                 if not pending:
                     return
                 ended = wait(pending, PATIENCE, FIRST_COMPLETED).done
@@ -82,11 +82,18 @@ class Workers:
                     if loss is not None:
                         raise loss
                     yield pending.pop(future), partial(_result, future)
-        except BrokenExecutor as error:
-            raise MachineError(DIED) from error
         finally:
             for future in pending:
                 future.cancel()
+
+    def _submitted(self, function: Callable[[Item], Result], item: Item) -> Future[Result]:
+        """Submit a task; where processes have died it fails as they do, after those that have ended before."""
+        try:
+            return self._executor.submit(function, item)
+        except BrokenExecutor as error:
+            failed: Future[Result] = Future()
+            failed.set_exception(error)
+            return failed
 
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], progress: Progress, count: int

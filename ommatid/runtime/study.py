@@ -34,7 +34,8 @@ def study(
         `failed`, which no journal keeps
     report : is called with every row, and True if it is new
     """
-    known = {_identity(entry["cell"]): entry["row"] for entry in entries(journal) if {"cell", "row"} <= entry.keys()}
+    kept = [entry for entry in entries(journal) if "cell" in entry and isinstance(entry.get("row"), dict)]
+    known = {_identity(entry["cell"]): entry["row"] for entry in kept}
     rows: list[Row] = []
     for cell in cells:
         row = known.get(_identity(cell))

@@ -24,7 +24,7 @@ from ommatid.bench.table import AUTO, CSV, JSON, BenchTable, Cell, Setting, Stag
 from ommatid.pipeline.stages import open_scene
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.progress import no_progress
-from ommatid.runtime.study import FAILED, Row, study
+from ommatid.runtime.study import FAILED, Row, append, study
 from ommatid.scenes.camera import derive
 
 from ..conftest import Command
@@ -129,6 +129,7 @@ def test_known_cells_are_not_repeated_and_each_new_one_is_kept(tmp_path: Path) -
     assert (Cell(**first[0]).samples, first[1][FAILED]) == (4, "thirteen cannot be done")
     with journal.open("ab") as file:
         file.write(b'\xff\n[1]\n{"cell": 3}\n{"cell": {"sta')
+    append(journal, {"cell": settings_of(16)[0], "row": 5})  # which no study has written
     again = study(journal, settings_of(4, 16), work(ran).measure)
     assert ran[6:] == [(16, repeat) for repeat in range(5)]
     assert again == study(journal, settings_of(4, 16), work(ran).measure)

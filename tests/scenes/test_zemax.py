@@ -134,6 +134,7 @@ REFUSED = {
     "strong": ("PARM 8 -3e-9", "PARM 8 1e3", "surface 3: .* aspheric term .* a16 = 1000"),
     "back": ("DISZ 2\n  GLAS", "DISZ -2\n  GLAS", "surface 3: thickness: expected a length above zero, got '-2.0 mm'"),
     "index": ("1.5168 64.17", "9.9 0", "surface 6: index: expected a number of at most 5, got 9.9"),
+    "sign": ("1.5168 64.17", "-1.5168 64.17", "surface 6: expected a glass of nd from 1 to 5, got -1.5168"),
     "stops": ("SURF 4", "SURF 4\n  STOP", "expected one aperture stop at most, got 2"),
     "many": ("SURF 4", "SURF 4\n" * 2000, "expected at most 200 surfaces"),
 }

@@ -237,6 +237,8 @@ def _model_glass(words: list[str], where: str) -> dict[str, Any]:
         )
     if not abbe:
         return {"index": index}
+    if not 1 <= index <= 5:  # the formula is a square, which hides a sign
+        raise InputError(f"{where}: expected a glass of nd from 1 to 5, got {index:g}")
     inverse = {line: wavelength**-2 for line, wavelength in FRAUNHOFER.items()}
     slope = (index - 1) / abbe / (inverse["F"] - inverse["C"])
     level = index - slope * inverse["d"]

@@ -176,6 +176,9 @@ def test_a_palette_is_looked_up(bits: int, tmp_path: Path) -> None:
     decoded = pixels_in(path, made.png(indices, 3, bits, made.chunk(b"PLTE", table.tobytes())))
     np.testing.assert_array_equal(decoded, table[indices])
     assert "a.png has a palette: its colours are looked up" in sentences(path)
+    lacking = made.png(indices, 3, bits, made.chunk(b"PLTE", table[: indices.max()].tobytes()))
+    with pytest.raises(InputError, match="it has colours that its palette lacks"):
+        pixels_in(path, lacking)
 
 
 @pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])

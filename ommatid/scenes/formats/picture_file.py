@@ -97,6 +97,8 @@ def _png(stream: BinaryIO, path: Path) -> Iterator[StoredPicture]:
         channels = MOST_COLOURS if is_palette else len(opened.getbands()) + ("transparency" in info)
         check_size(path, prod(opened.size) * channels)
         opened.load()  # what stands behind the pixels, too
+        if is_palette and described.getextrema()[1] >= len(described.palette.palette) // len("RGB"):
+            raise ValueError("it has colours that its palette lacks")  # black, by libpng
         orientation = _orientation(opened)
     with silenced():
         pixels = np.asarray(cast(Any, imagecodecs).png_decode(data))

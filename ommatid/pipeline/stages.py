@@ -14,7 +14,7 @@ from ommatid.batch.remote import RunObserver, Stages
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.estimate_formats import Format, write_formats
-from ommatid.reconstruct.output.run_json import PAGE, RunReport
+from ommatid.reconstruct.output.run_json import PAGE, RunReport, TimeReport
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.machine import one_thread
 from ommatid.runtime.outputs.occupied import occupied
@@ -171,7 +171,9 @@ def results(setup: Setup, folder: Path, observer: RunObserver, force: bool = Fal
     worked = {"render": rendered, "calibrate": calibrated, "reconstruct": made}
     files = perf_counter() - begun - sum(report.stages[name].seconds for name, ran in worked.items() if ran)
     earlier = earlier_report(folder, report.fingerprint)
-    report = report if earlier is None else earlier
+    if earlier is not None:  # its time limit was that of another command
+        spent = earlier.spent.model_dump(include={"start_up"}, exclude_none=True)
+        report = earlier.with_changes(spent=TimeReport(**spent))
     if earlier is None and scene.world is not None:
         from ommatid.analysis.depth_error import depth_error_of_run
 

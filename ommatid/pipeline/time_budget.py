@@ -64,7 +64,8 @@ class TimeBudget:
         force = self.force
         earlier = None if force else _earlier_run(folder, setup, request)
         if earlier is not None:
-            return stages.run(_with_samples(setup, *_samples_of(earlier)), folder, observer)
+            results = stages.results(_with_samples(setup, *_samples_of(earlier)), folder, observer)
+            return _finished(results, earlier, folder, observer)
         samples: tuple[Samples, Samples] = (FEW, FEW)
         page = 0.0
         while True:
@@ -88,8 +89,12 @@ class TimeBudget:
             self.say(f"{folder}: took {total:.1f} s of {seconds:g} s with {counts}")
         chosen: dict[str, Samples] = dict(zip(KEYS, samples, strict=True))
         limit = {"within": seconds, "asked": request, "seconds": total, "chosen": chosen}
-        report = results.report.with_changes(spent=results.report.spent.model_copy(update=limit))
-        return finish(replace(results, report=report), folder, observer).plain()
+        return _finished(results, results.report.spent.model_copy(update=limit), folder, observer)
+
+
+def _finished(results: StageResults, spent: TimeReport, folder: Path, observer: RunObserver) -> dict[str, Any]:
+    """Write page and run.json of results with these times, and return the content of run.json."""
+    return finish(replace(results, report=results.report.with_changes(spent=spent)), folder, observer).plain()
 
 
 def _more_samples(

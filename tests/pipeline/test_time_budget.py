@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ommatid.batch.remote import RunObserver
+from ommatid.pipeline import stages
 from ommatid.pipeline.time_budget import FEW, KEYS, TimeBudget, allocate
 from ommatid.reconstruct.output.run_json import RunReport
 from ommatid.runtime.progress import no_progress
@@ -56,8 +57,8 @@ def test_a_stage_without_samples_takes_no_time() -> None:
 # --- runs
 
 
-def setup_of(sampler: str = "independent", **tables: Any) -> Setup:
-    render = {"samples": 64, "variant": "scalar_rgb", "sampler": sampler}
+def setup_of(sampler: str = "independent", samples: int = 64, **tables: Any) -> Setup:
+    render = {"samples": samples, "variant": "scalar_rgb", "sampler": sampler}
     return Setup.from_scene(
         scene((12, 12), (("1/3", [3, 3], [3, 3]),), render=render, noise={"variance": 1e-2}, **tables)
     )
@@ -89,11 +90,16 @@ def stamps(folder: Path) -> list[int]:
 
 
 def test_the_fewest_samples_are_taken_and_reported_if_they_take_too_long(tmp_path: Path) -> None:
-    description, messages = within(tmp_path / "x", setup_of(), 3.0, ticking(2.0))
+    """A run of as many samples without a time limit then makes nothing again, but has none of the limit's times."""
+    folder = tmp_path / "x"
+    description, messages = within(folder, setup_of(), 3.0, ticking(2.0))
     assert description["spent"]["chosen"] == dict.fromkeys(KEYS, FEW)
     assert description["spent"]["seconds"] > 3.0
     [message] = messages
     assert "of 3 s with 256 and 256 samples per pixel, the fewest possible" in message
+    before = stamps(folder)
+    spent = stages.run(setup_of(samples=FEW, calibration={"samples": FEW}), folder, OBSERVER)["spent"]
+    assert (stamps(folder), spent.keys() & {"within", "asked", "seconds", "chosen"}) == (before, set())
 
 
 @pytest.mark.slow

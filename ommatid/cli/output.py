@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, nullcontext, suppress
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -123,6 +124,7 @@ class Bars:
             transient=True,
             disable=disabled,
             redirect_stdout=False,  # results never go to stderr
+            speed_estimate_period=inf,  # the time left is estimated from all steps, each of which may take minutes
         )
 
     @contextmanager

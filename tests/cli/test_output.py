@@ -13,6 +13,7 @@ import pytest
 import tifffile
 from PIL import Image
 
+from ommatid.cli import output
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.estimate_formats import write_formats
 from ommatid.reconstruct.output.verdict_words import error_words
@@ -260,3 +261,13 @@ def test_results_without_a_verdict_get_one(kept: Path, ommatid: Command) -> None
     ended = ommatid("run", "tiny.toml", "-o", "out", "--strict")
     assert ended.code == 3
     assert json.loads(path.read_text(encoding="utf-8"))["verdict"] == verdict
+
+
+def test_the_time_left_is_known_after_two_steps_of_minutes() -> None:
+    shown, now = output.Bars()._shown, [0.0]  # pyright: ignore[reportPrivateUsage]
+    shown.get_time = lambda: now[0]
+    task = shown.add_task("scenes", total=1.0)
+    for step in (1, 2):
+        now[0] = 300.0 * step
+        shown.update(task, completed=step / 4)
+    assert shown.tasks[0].time_remaining == pytest.approx(600)

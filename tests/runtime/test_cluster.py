@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import gc
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import warnings
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -18,13 +21,18 @@ import pytest
 from dask import config
 from distributed import LocalCluster, Security
 
-from ommatid.pipeline.batches import Batch
+from ommatid.batch.remote import SILENT as SILENT_OBSERVER
+from ommatid.batch.remote import RunObserver
+from ommatid.pipeline.batches import Batch, batch_members, run_batch
+from ommatid.pipeline.stages import render
 from ommatid.runtime.errors import InputError, MachineError
 from ommatid.runtime.execution import workers
 from ommatid.runtime.execution.cluster import SILENT, Cluster, cluster_workers, worker_pool
 from ommatid.runtime.progress import no_progress
+from ommatid.scenes.setup import Setup
 
 from ..conftest import TINY, Command
+from ..runs import content, differences
 
 VERSIONS = {"ommatid": "1"}
 
@@ -235,6 +243,32 @@ def test_a_task_of_endless_recursion_ends() -> None:
         ((_, result),) = pool.each(endless, [0])
         with pytest.raises(RuntimeError, match="RecursionError: maximum recursion"):
             result()
+
+
+def die_once(folder: Path, setup: Setup, output: Path, observer: RunObserver) -> dict[str, Any]:
+    """Render a scene; the first worker that has rendered scene b is killed before it says so."""
+    described = render(setup, output, observer)
+    if setup.scene.source.stem == "b" and not (folder / "died").exists():
+        (folder / "died").write_text(str(os.getpid()), encoding="ascii")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return described
+
+
+@pytest.mark.slow
+def test_a_batch_gives_the_same_bits_though_one_of_two_workers_is_killed(tmp_path: Path) -> None:
+    for name in "abc":
+        Path(f"{name}.toml").write_text(TINY, encoding="utf-8")
+
+    def files(name: str, cluster: Cluster | None = None) -> dict[str, Any]:
+        members = batch_members([Path(f"{scene}.toml") for scene in "abc"], Path(name), None, (), ())
+        batch = Batch(partial(die_once, tmp_path), lambda _: SILENT_OBSERVER, lambda _, description: description)
+        assert run_batch(batch, members, lambda error: pytest.fail(str(error)), cluster, 1).exit_code == 0
+        return content(Path(name))
+
+    with started(n_workers=2, processes=True) as cluster:
+        shared = files("shared", Cluster(cluster.scheduler_address))
+    assert int(Path("died").read_text(encoding="ascii")) != os.getpid()
+    assert differences(shared, files("alone")) == []
 
 
 @pytest.mark.slow

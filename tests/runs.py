@@ -31,7 +31,7 @@ def report_of(**fields: Any) -> RunReport:
         "measurements": 1,
         "unknowns": 1,
         "stages": {"render": {}, "calibrate": {}, "reconstruct": {}},
-        "error": {"predicted_mse": 1.0, "budget": {}},
+        "error": {"predicted_mse": 1.0, "budget": {"noise": 1.0}},
         "solver": {**form, **numbers},
         "diagnostics": {**nothing, "chi_squared": None},
         "model": {"rms_difference_from_ideal": None, "max_z": None, "p_value": None, "spurious_information": 0.0},

@@ -38,7 +38,7 @@ from ommatid.reconstruct.noise import known_noise, usable_pixels
 from ommatid.reconstruct.output.result_files import BASELINES
 from ommatid.reconstruct.output.run_json import BaselineMethod, MethodReport
 from ommatid.runtime.arrays import Float32Array, FloatArray
-from ommatid.runtime.files import cached
+from ommatid.runtime.files import UNREADABLE, cached
 from ommatid.runtime.machine import one_thread
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.camera import Camera
@@ -49,7 +49,6 @@ from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables.estimation import PriorTable
 
 LARGEST = 2**18  # pixels of f up to which total variation takes minutes
-UNREADABLE = OSError, ValueError, KeyError, TypeError  # reading what is missing or of another program
 HALF = 1e-6  # of a pixel, within which a position lies halfway between two
 WEIGHTS = tuple(3.0**-power for power in range(-2, 8))  # per grey level
 RISEN = 1.05  # ratio to the least error from which smaller weights are not tried

@@ -181,6 +181,7 @@ def _write_page(folder: Path) -> None:
     truth = result_files.truth_beside(folder / STACK, results.stack)
     if results.report.fingerprint != result_files.fingerprint_of(results.stack, results.model, truth, regions):
         raise InputError(f"{folder}: run.json is of another stack or model than those beside it; run the scene again")
+    result_files.check_results(folder, results.report.fingerprint)
     write_page(results, folder, SILENT)
 
 

@@ -129,10 +129,8 @@ def add_baselines(folder: Path, progress: Progress) -> RunReport:
         raise InputError(f"{folder}: --baselines compares with the truth, which is not known here; leave it out")
     results = StageResults.read(folder)
     report, files = results.report, (results.stack, results.model)
-    found = cached_baselines(folder, report.fingerprint, *files, truth.astype("float64"), progress)
-    if found.reports == report.baselines:
-        return report
-    return finish(replace(results, report=report.with_changes(baselines=found.reports)), folder, SILENT)
+    cached_baselines(folder, report.fingerprint, *files, truth.astype("float64"), progress)
+    return finish(results, folder, SILENT)
 
 
 def check_run(setup: Setup, folder: Path) -> None:
@@ -186,9 +184,17 @@ def results(setup: Setup, folder: Path, observer: RunObserver, force: bool = Fal
 
 
 def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunReport:
-    """Write the page and run.json of results unless they are up to date, and return its content."""
+    """Write the page and run.json of results, with the baselines beside them, unless both are up to date.
+
+    Returns the content of run.json.
+    """
+    from ommatid.analysis.baselines import known_baselines
+
     begun, report = perf_counter(), results.report
-    write_page(results, folder, observer)
+    known = known_baselines(folder, report.fingerprint)
+    if known is not None:
+        report = report.with_changes(baselines=known.reports)
+    write_page(replace(results, report=report), folder, observer)
     if PAGE not in report.stages:
         report = report.with_stage(PAGE, perf_counter() - begun)
     earlier = earlier_report(folder, report.fingerprint)

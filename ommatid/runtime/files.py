@@ -31,6 +31,7 @@ LONGEST_FIELD = 1000  # characters of a text in a CSV file
 _SIGNED = re.compile(r"[-+](?:[\d.]+(?:[eE][-+]?\d+)?\s*[^\W\d_]*|inf|nan)")  # a number, also with a unit
 PART = ".part."  # in the name of a file that is still being written
 LONGEST_NAME = 100  # bytes of a name that is part of a temporary one, which file systems limit to 255 or 143
+UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError  # of files missing, damaged or of another kind
 written: set[Path] = set()  # absolute paths of the files that this process wrote
 
 
@@ -167,13 +168,13 @@ def cached(
 
     path : file, or folder of several files that belong together
     wanted : fingerprint of everything that the result depends on
-    read : yields the result and its fingerprint; may raise OSError, ValueError, KeyError, TypeError or AttributeError
-        for a file that is missing, damaged or of another kind, which is then made again
+    read : yields the result and its fingerprint; may raise UNREADABLE for a file that is missing, damaged
+        or of another kind, which is then made again
     write : writes what `make` returns; the result is read back, so that it is the same in this run and the next
     force : True to make it in any case
     """
     if not force:
-        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        with suppress(*UNREADABLE):
             content, made_from = read(path)
             if made_from == wanted:
                 return content, False

@@ -31,7 +31,7 @@ def run_of(mse: float, trusted: bool = True) -> RunReport:
     report = report_of(
         fingerprint=CELL.definition,
         verdict={"trusted": trusted, "reasons": () if trusted else ("a reason",)},
-        error={"mse": mse, "predicted_mse": 2.0, "budget": {}, "expected_given_truth": interval},
+        error={"mse": mse, "predicted_mse": 2.0, "budget": {"noise": 2.0}, "expected_given_truth": interval},
     )
     residual = ResidualReport.model_validate(chi)
     return report.with_changes(diagnostics=report.diagnostics.model_copy(update={"chi_squared": residual}))

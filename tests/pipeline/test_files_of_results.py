@@ -305,6 +305,31 @@ def test_a_page_of_results_of_two_runs_is_refused(kept: Path, ommatid: Command) 
     assert (result.code, "run.json is of another stack or model" in result.err) == (2, True)
 
 
+def test_a_page_beside_a_damaged_result_is_not_up_to_date(kept: Path, ommatid: Command) -> None:
+    message = "damaged or of another result than run.json"
+    for name, words in (("estimate.exr", "the file is cut short"), ("overview.png", message)):
+        whole = (kept / name).read_bytes()
+        (kept / name).write_bytes(whole[:-20])
+        result = ommatid("report", kept)
+        assert (result.code, words in result.err) == (2, True)
+        (kept / name).write_bytes(whole)
+
+
+def test_an_error_without_a_cause_is_no_report(kept: Path, ommatid: Command) -> None:
+    document = json.loads((kept / "run.json").read_text(encoding="utf-8"))
+    document["verdict"], document["error"]["budget"] = {"trusted": True, "reasons": []}, {}
+    (kept / "run.json").write_text(json.dumps(document), encoding="utf-8")
+    result = ommatid("report", kept)
+    assert (result.code, "run.json: expected the results of a run" in result.err) == (2, True)
+
+
+def test_baselines_outlive_run_json(kept: Path, ommatid: Command) -> None:
+    assert ommatid("report", kept, "--baselines").code == 0
+    (kept / "run.json").unlink()
+    assert ommatid("report", kept).code == 0
+    assert len(run_json.read(kept).baselines) > 1
+
+
 def test_a_truth_that_is_known_later_counts(finished: Path, here: Path, ommatid: Command) -> None:
     (here / "recorded").mkdir()
     for name in ("stack.exr", "model.npz"):

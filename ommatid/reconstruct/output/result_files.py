@@ -15,7 +15,7 @@ import numpy as np
 from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.workers import Workers
-from ommatid.runtime.files import cached, digest, fingerprint, write_whole
+from ommatid.runtime.files import UNREADABLE, cached, digest, fingerprint, write_whole
 from ommatid.runtime.input_files import open_input
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import origin
@@ -188,6 +188,20 @@ def read_results(folder: Path) -> tuple[RunReport, str | None]:
     """Return the report of the estimate in a folder, and its fingerprint if the pictures beside it are whole."""
     report = read_report(folder / ESTIMATE)
     return report, report.fingerprint if all(_is_whole(folder / name) for name in (PICTURE, OVERVIEW)) else None
+
+
+def check_results(folder: Path, fingerprint: str) -> None:
+    """Raise InputError unless a folder holds a whole estimate of this fingerprint, with its pictures."""
+    try:
+        made_from = read_results(folder)[1]
+    except InputError:
+        raise
+    except UNREADABLE:
+        made_from = None
+    if made_from != fingerprint:
+        raise InputError(
+            f"{folder}: {ESTIMATE} or a picture of it is damaged or of another result than {RUN}; run the scene again"
+        )
 
 
 def _is_whole(picture: Path) -> bool:

@@ -105,8 +105,8 @@ class ErrorReport(Record):
 
     @model_validator(mode="after")
     def _check_parts(self) -> ErrorReport:
-        if self.predicted_mse == 0 and any(part > 0 for part in self.budget.values()):
-            raise ValueError("expected a predicted_mse above 0 beside a budget with parts")
+        if (self.predicted_mse > 0) != any(part > 0 for part in self.budget.values()):
+            raise ValueError("expected parts above 0 in the budget of a predicted_mse above 0, and of no other")
         return self
 
 

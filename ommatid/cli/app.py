@@ -18,6 +18,7 @@ from typing import Annotated
 import typer
 
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.execution.interrupts import heed_interrupts
 from ommatid.runtime.execution.library_warnings import library_warnings
 from ommatid.runtime.library_caches import library_caches
 from ommatid.runtime.printable import printable
@@ -73,6 +74,7 @@ def start(version: Version = False) -> None:
 
 def main() -> None:
     """Run the command line and exit."""
+    heed_interrupts()
     prepare_streams()
     use_utf8_names()
     with command_line(["ommatid", *sys.argv[1:]]), library_caches(), library_warnings(output.warn):

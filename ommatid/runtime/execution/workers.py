@@ -33,6 +33,7 @@ from ..errors import InputError, MachineError
 from ..printable import printable
 from ..progress import Progress
 from .interpreter import ignore_configurations, import_path, python_environment
+from .interrupts import interrupt_once
 from .library_warnings import library_warnings, warn_on_stderr
 
 Item = TypeVar("Item")
@@ -246,18 +247,11 @@ def _begin(numbers: Any, count: int) -> None:
 
 def _interruptible(task: Callable[[], Result]) -> Result:
     """Execute a task in this process, which Ctrl-C interrupts."""
-    signal.signal(signal.SIGINT, _interrupt_once)
+    signal.signal(signal.SIGINT, interrupt_once)
     try:
         return with_error_to_send(task)
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _interrupt_once(number: int, frame: object) -> None:
-    """Raise KeyboardInterrupt, and ignore further signals while the task stops."""
-    del frame
-    signal.signal(number, signal.SIG_IGN)
-    raise KeyboardInterrupt
 
 
 def _restrict_processors(index: int, count: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from ommatid.reconstruct.held_out.check import check_held_out
 from ommatid.reconstruct.restore import restore
 from ommatid.reconstruct.verdict.causes import CAUSES, remedies
 from ommatid.runtime.arrays import FloatArray
+from ommatid.scenes import model_file
+from ommatid.scenes import stack as stack_file
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.model import RECORDED, Model
@@ -250,3 +253,12 @@ def test_what_was_done_is_not_recommended() -> None:
     assert "--flat" in said("ideal", imported)["flat"]
     assert "--flat" not in said("ideal", imported | {"flat": True})["flat"]
     assert "--flat" not in said("ideal", {})["flat"]
+
+
+def test_an_h_beside_which_no_reading_counts_has_no_cause(finished: Path) -> None:
+    stack, model = stack_file.read(finished / "stack.exr"), model_file.read(finished / "model.npz")
+    assert model.stored is not None
+    stored = model.stored.copy()
+    stored.data[:] = 1e6
+    verdict = restore(stack, replace(model, stored=stored), None).verdict
+    assert not verdict.trusted

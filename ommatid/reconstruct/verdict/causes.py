@@ -290,12 +290,17 @@ class _Search:
     def _apart(self) -> Iterator[Fault]:
         """Yield the most likely damaged pixels, and all readings of one of the worst sub-imagers."""
         unit, left, chosen = sparse.eye_array(self.m.size, format="csc"), self.m, list[int]()
+        weights = self.precision.diagonal()
         for index in self._worst:
             error, where = self._error_of(index), self._named([index])
             count = int((self.of_sub == index).sum())
             yield Fault("sub-imager", _column(error), count, lambda _, where=where: ([], where), known=True)
         for count in range(1, min(MOST_PIXELS, self.m.size // 10) + 1):
-            chosen.append(int(np.argmax(left**2 / self.precision.diagonal())))
+            gains = np.divide(left**2, weights, out=np.zeros_like(left), where=weights > 0)
+            gains[chosen] = 0.0
+            if not gains.any():  # no reading that counts is left
+                return
+            chosen.append(int(np.argmax(gains)))
             rows = np.array(chosen)
             left = self.m - self.precision @ (unit[:, rows] @ self._on(rows, self.m[rows]))
             where = self._named(list(dict.fromkeys(self.of_sub[rows].tolist())))
@@ -410,6 +415,8 @@ class _Search:
         excess = (squares[seen] - expected).sum()
         if added > step**2 / 24 and (expected * added / noise[seen]).sum() > EXPLAINED * excess:
             return "bits", [step, float(np.log2(FULL_SCALE / step)), added]
+        if not seen.any():
+            return "unknown", []
         slopes = self._effects(self.method.image)["shift"]
         found = {
             "noise": self._growth(np.ones(noise.size)),

@@ -21,6 +21,7 @@ from ommatid.runtime.errors import InputError
 from .family import fingerprint
 
 REFUSED, UNCHANGED, VALID = "refused", "read unchanged", "valid, but different"
+SEVERAL = "run", "render", "predict"  # commands on several scenes, which print a document of one that is refused, too
 VERDICTS = (REFUSED, UNCHANGED, VALID)
 LONGEST_MESSAGE = 500  # characters of an error of the library
 LONGEST_SENTENCE = 1000  # characters of a line that a command writes to stderr
@@ -82,11 +83,8 @@ def _acts(character: str) -> bool:
     return character != "\n" and unicodedata.category(character) in NOT_PRINTABLE
 
 
-def command_verdict(ended: CommandEnd, words: Sequence[str], results: bool = False) -> str:
-    """Return REFUSED or VALID for a command that behaved, else a description of what it did wrong.
-
-    results : True if a refused command may print on stdout, as those on several scenes do
-    """
+def command_verdict(ended: CommandEnd, words: Sequence[str]) -> str:
+    """Return REFUSED or VALID for a command that behaved, else a description of what it did wrong."""
     code, out, err = ended.code, ended.out, ended.err
     lines = err.splitlines()
     if "ommatid: unexpected" in err:
@@ -98,7 +96,7 @@ def command_verdict(ended: CommandEnd, words: Sequence[str], results: bool = Fal
         faults.append(f"a sentence of {max(map(len, lines))} characters: {max(lines, key=len)[:200]!r}")
     if code == 2:
         last = ("ommatid: ", "warning: ", *(("job ",) if "--job" in words else ()))  # which says what all jobs did
-        if not lines or not lines[-1].startswith(last) or (out and not results):
+        if not lines or not lines[-1].startswith(last) or (out and words[0] not in SEVERAL):
             faults.append(f"refused with {err[:300]!r} and printed {out[:60]!r}")
     elif code not in (0, 3):
         faults.append(f"ended with {code}: {err[:300]!r}")

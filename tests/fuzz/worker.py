@@ -111,9 +111,7 @@ class CommandRunner:
         case = self._family.case(Random(f"{self._family.name} {seed} {number}"), self._folder)
         before, alive = self._sandbox.entries(), children()
         ended = run_command(case.words)
-        verdict = command_verdict(
-            ended, case.words, results=case.words[0] in ("run", "render") or "--sweep" in case.words
-        )
+        verdict = command_verdict(ended, case.words)
         faults: list[str] = [] if verdict in VERDICTS else [verdict]
         if verdict in VERDICTS and case.refused is not None and case.refused != (verdict == REFUSED):
             faults.append(f"expected {'a refusal' if case.refused else 'a result'}, got {verdict}: {ended.err[:300]!r}")

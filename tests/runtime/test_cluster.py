@@ -41,6 +41,13 @@ def versions() -> dict[str, str]:
     return VERSIONS
 
 
+def lost_on_a_worker(asked: list[None] = []) -> dict[str, str]:  # noqa: B006  # by this process first
+    if asked:
+        raise ConnectionResetError("Connection reset by peer")
+    asked.append(None)
+    return VERSIONS
+
+
 def squared(number: int) -> int:
     return number**2
 
@@ -231,6 +238,8 @@ def test_a_scheduler_that_stops_answering_is_not_waited_for(monkeypatch: pytest.
 def test_a_worker_that_joins_later_with_another_version_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     with started() as cluster, worker_pool(Cluster(cluster.scheduler_address)) as pool:
         pool.check_versions(versions)
+        with pytest.raises(MachineError, match=r"the worker \S+ was lost; repeat the command"):
+            pool.check_versions(lost_on_a_worker)
         assert pool.map(squared, range(2), no_progress, 2) == [0, 1]
         monkeypatch.setattr(f"{__name__}.VERSIONS", {"ommatid": "2"})  # what the worker says from now on
         with pytest.raises(InputError, match=r"the worker \S+ has ommatid 2, here 1; install the same versions"):

@@ -109,6 +109,8 @@ class _ClusterWorkers(Workers):
                 f"{self._cluster}: not all workers answered within {workers.ANSWER:g} s; restart those that hang"
             ) from error
         for worker, answer in answers.items():
+            if isinstance(answer, OSError):  # of its connection
+                raise MachineError(f"{self._cluster}: the worker {printable(worker)} was lost; repeat the command")
             if isinstance(answer, Exception):
                 raise InputError(_unusable(self._cluster, worker, answer))
             _check_same(str(self._cluster), worker, expected, answer)

@@ -25,7 +25,7 @@ from ommatid.reconstruct.restore import check_camera, check_region
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import worker_pool
 from ommatid.runtime.execution.workers import Workers
-from ommatid.runtime.files import clear_abandoned, file_digest, fingerprint, temporary_file
+from ommatid.runtime.files import UNREADABLE, clear_abandoned, file_digest, fingerprint, not_written, temporary_file
 from ommatid.runtime.input_files import real_path
 from ommatid.runtime.outputs.kinds import check_folder, check_name
 from ommatid.runtime.outputs.occupied import new_folder
@@ -81,7 +81,7 @@ class Frame:
 
     def finished(self) -> RunReport | None:
         """Return the report of an estimate that is there and up to date, else None."""
-        with suppress(OSError, ValueError, KeyError, TypeError, InputError):
+        with suppress(*UNREADABLE):
             report = result_files.read_report(self.output)
             if report.fingerprint == self.fingerprint and self.output.with_suffix(".png").is_file():
                 return report
@@ -197,7 +197,10 @@ def _in_processes(frames: Sequence[Frame], prepared: Prepared, options: FrameOpt
     if not others:
         return
     with temporary_file(frames[0].output.with_name("prepared")) as contents:
-        contents.write_bytes(pickle.dumps(prepared.contents(*SENT)))
+        try:
+            contents.write_bytes(pickle.dumps(prepared.contents(*SENT)))
+        except OSError as error:
+            raise not_written(frames[0].output.parent, error) from error
         with worker_pool(count=min(workers, len(others))) as pool:
             for index, result in pool.each(partial(_made_in_process, options, contents), others):
                 yield others[index], result

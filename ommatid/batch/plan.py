@@ -17,6 +17,7 @@ from ommatid.analysis.calibration_goal import for_stack
 from ommatid.reconstruct.method_choice import PROGRAM_MEMORY, allowed_memory, choose_method
 from ommatid.reconstruct.output.result_files import fingerprint_of, read_results, truth_beside
 from ommatid.runtime.errors import InputError
+from ommatid.runtime.files import UNREADABLE
 from ommatid.runtime.machine import processors
 from ommatid.scenes import model_file, stack
 from ommatid.scenes.formats import exr
@@ -78,7 +79,7 @@ def lines(name: str, described: dict[str, Any]) -> list[str]:
 def _states(folder: Path, setup: Setup) -> dict[str, str]:
     """Return the state of each stage. A stage is up to date only if those before it are."""
     states: dict[str, str] = dict.fromkeys(STAGES, TO_MAKE)
-    with suppress(OSError, ValueError, KeyError, TypeError, InputError):
+    with suppress(*UNREADABLE):
         record = exr.read_first_record(folder / "stack.exr")["record"]
         if record["fingerprint"] != render.made_from(setup):
             return states

@@ -23,7 +23,7 @@ from ommatid.reconstruct.restore import check_camera
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.execution.cluster import Cluster, worker_pool
 from ommatid.runtime.execution.workers import Workers
-from ommatid.runtime.files import file_digest, write_whole
+from ommatid.runtime.files import UNREADABLE, file_digest, write_whole
 from ommatid.runtime.input_files import read_text, real_path
 from ommatid.runtime.outputs.kinds import check_folder, check_inside, check_name, check_output
 from ommatid.runtime.outputs.occupied import occupied
@@ -283,7 +283,7 @@ def _write_designed_model(stack: Path, model: Path, progress: Progress) -> str:
 
 def _remove_other_scene(folder: Path, recorded: Stack) -> None:
     """Remove the scene.toml that an earlier run wrote beside its stack, unless `recorded` is of the same scene."""
-    with suppress(OSError, ValueError, KeyError, InputError):
+    with suppress(*UNREADABLE):
         written = toml.loads(read_text(folder / "scene.toml"))
         earlier, _ = stack_file.read_header(folder / STACK)
         if written == earlier.plain() != recorded.scene.plain():

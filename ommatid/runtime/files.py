@@ -50,10 +50,13 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
             temporary.replace(path)
             written.add(path.absolute())
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise MachineError(
-            f"{path}: could not be written ({reason}); free some space or choose another folder"
-        ) from error
+        raise not_written(path, error) from error
+
+
+def not_written(path: Path, error: OSError) -> MachineError:
+    """Return what to say where the machine refused to write a file."""
+    reason = error.strerror or str(error)
+    return MachineError(f"{path}: could not be written ({reason}); free some space or choose another folder")
 
 
 def short_name(name: str) -> str:

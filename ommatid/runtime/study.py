@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from .errors import InputError, MachineError
-from .files import write_csv
+from .errors import InputError
+from .files import not_written, write_csv
 from .input_files import read_bytes
 from .outputs.kinds import check_output
 
@@ -71,7 +71,7 @@ def append(path: Path, *rows: Row) -> None:
                 lines = lines if file.read(1) == b"\n" else "\n" + lines
             file.write(lines.encode())
     except OSError as error:
-        raise MachineError(f"{path}: could not be written ({error.strerror or error}); free some space") from error
+        raise not_written(path, error) from error
 
 
 def entries(path: Path) -> Iterator[Row]:

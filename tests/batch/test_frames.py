@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,19 @@ def assert_same(path: Path, other: Path) -> None:
     for name in here:
         np.testing.assert_array_equal(here[name], alone[name])
     assert path.with_suffix(".png").read_bytes() == other.with_suffix(".png").read_bytes()
+
+
+def test_a_disk_that_is_full_for_what_processes_share_is_one_sentence(
+    film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ommatid: Command
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    ended = ommatid("reconstruct", *stacks(film), film / "model.npz", "-o", tmp_path / "out", "--workers", "2", "-q")
+    assert ended.code == 1
+    assert f"{tmp_path / 'out'}: could not be written (No space left on device); free some space" in ended.err
+    assert not list((tmp_path / "out").glob(".*"))
 
 
 def test_a_run_that_was_interrupted_does_what_is_missing(film: Path, tmp_path: Path, ommatid: Command) -> None:

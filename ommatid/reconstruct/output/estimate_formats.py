@@ -11,7 +11,7 @@ import numpy as np
 
 from ommatid.runtime.arrays import Float32Array
 from ommatid.runtime.errors import InputError, shortened
-from ommatid.runtime.files import write_whole
+from ommatid.runtime.files import UNREADABLE, write_whole
 from ommatid.scenes.constants import WHITE
 from ommatid.scenes.formats import exr, npz, tiff
 
@@ -78,7 +78,7 @@ def _in_the_way(path: Path) -> InputError:
 
 
 def _is_estimate(path: Path) -> bool:
-    with suppress(OSError, ValueError, KeyError, InputError):
+    with suppress(*UNREADABLE):
         return {"estimate", "variance"} <= exr.read(path)[0].channels.keys()
     return False
 
@@ -87,7 +87,7 @@ def shows_estimate(path: Path, estimate: Path) -> bool:
     """Whether a .npy file holds the estimate of an OpenEXR file, or a .tiff file was written for one."""
     if not path.is_file():
         return False
-    with suppress(OSError, ValueError, KeyError, InputError):
+    with suppress(*UNREADABLE):
         if path.suffix == ".npy":
             image = exr.read(estimate)[0].channels["estimate"]
             return np.array_equal(npz.array(path), image, equal_nan=True)

@@ -179,10 +179,13 @@ def _crop(picture: FloatArray, scene: Scene) -> FloatArray:
     shape = (left[0] // target.detail, left[1] // target.detail) if target.shape is None else target.shape
     rows, columns = finer(shape, target.detail)
     if rows <= 0 or columns <= 0 or row + rows > picture.shape[0] or column + columns > picture.shape[1]:
+        room = picture.shape[0] - max(rows, 0), picture.shape[1] - max(columns, 0)
+        largest = [size // target.detail for size in picture.shape]
+        key, most = ("origin", [*room]) if min(room) >= 0 else ("shape", largest)
         raise InputError(
             f"{scene.source}: target.origin: the crop of {max(rows, 0)} x {max(columns, 0)} pixels at"
             f" [{row}, {column}] is empty or leaves the picture of {picture.shape[0]} x {picture.shape[1]} pixels;"
-            " correct it or target.shape, or remove both for the whole picture"
+            f" expected a target.{key} of at most {most}, or neither for the whole picture"
         )
     return picture[row : row + rows, column : column + columns]
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -60,25 +61,27 @@ class ChartRows:
     values: FloatArray
     batches: Float32Array
 
-    @property
+    @cached_property
     def light(self) -> FloatArray:
         """Share of a pixel's rays that meet the target: (pixels,)."""
         return self.values.sum(axis=(1, 2))
 
-    @property
+    @cached_property
     def known(self) -> BoolArray:
         """True for entries that were measured, (pixels, W, V), where each has noise."""
         return (self.batches != 0).any(axis=0)
 
+    @cached_property
     def centroids(self) -> tuple[FloatArray, FloatArray]:
-        """Return the centroids of the rows, in rows and columns of f: (pixels,) each."""
+        """The centroids of the rows, in rows and columns of f: (pixels,) each."""
         nothing = np.zeros(self.row.size)
         down, across = (along[0] for along in self._along(self.values[None], (nothing, nothing)))
         return down, across
 
+    @cached_property
     def batch_centroids(self) -> tuple[FloatArray, FloatArray]:
-        """Return the deviations of the batches' centroids to first order: (batches, pixels), rows and columns of f."""
-        down, across = self._along(self.batches, self.centroids())
+        """The deviations of the batches' centroids to first order: (batches, pixels), rows and columns of f."""
+        down, across = self._along(self.batches, self.centroids)
         return down, across
 
     def _along(self, values: NDArray[np.floating], origin: Sequence[FloatArray]) -> Iterator[FloatArray]:

@@ -53,6 +53,7 @@ REDUCTIONS = (
     ((MAGNIFICATION,), "designed"),
     ((ROW, COLUMN), "designed"),
 )
+Interval = tuple[FloatArray, float]  # where boxes begin, and how long they are
 Structure = tuple[str, ...]  # of each number "own", "shared" or "designed"
 SHIFTS: Structure = ("own", "own", "designed", "designed", "designed")
 FREE: Structure = ("own", "own", "own", "own", "shared")  # distortion is the lens type's
@@ -84,7 +85,7 @@ def _boxes(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows
     return shares[0][:, :, None] * shares[1][:, None, :]
 
 
-def _intervals(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> list[tuple[FloatArray, float]]:
+def _intervals(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows) -> list[Interval]:
     """Return where these boxes begin, in rows and in columns of f, (pixels,) each, and how long they are."""
     down, across = offsets(sub, (chart.down, chart.across))
     moved = (numbers - designed(sub)) * (np.arange(numbers.size) != MAGNIFICATION)
@@ -125,12 +126,12 @@ def _rows(camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows)
 
 
 def _expected(
-    camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows
+    camera: Camera, sub: SubImager, numbers: FloatArray, chart: ChartRows, intervals: list[Interval]
 ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the light and the centroids of the chart's pixels, (pixels,) each, also outside the chart's windows."""
     if has_boxes(sub, numbers):
         shares, middles = list[FloatArray](), list[FloatArray]()
-        for (start, width), size in zip(_intervals(camera, sub, numbers, chart), camera.shape, strict=True):
+        for (start, width), size in zip(intervals, camera.shape, strict=True):
             first, last = np.maximum(start, 0), np.minimum(start + width, size)
             shares.append(np.maximum(last - first, 0) / width)
             middles.append((first + last) / 2)
@@ -267,8 +268,8 @@ def _centroids(
 
     matched : True takes the moves that explain a row's entries best, which noise far from its light does not disturb
     """
-    light, expected = _expected(camera, sub, numbers, chart)
     boxes, intervals = _designed_boxes(sub), _intervals(camera, sub, numbers, chart)
+    light, expected = _expected(camera, sub, numbers, chart, intervals)
     least = LEAST_LIGHT if boxes else 1 - LOST
     kept, slopes = (light > least) & (chart.light > least), np.ones((2, light.size))
     for slope, (start, width), size in zip(slopes, intervals, camera.shape, strict=True):
@@ -278,8 +279,8 @@ def _centroids(
     if matched:
         moves, scatter = _matched_moves(camera, sub, numbers, chart)
     else:
-        moves = [one - other for one, other in zip(chart.centroids(), expected, strict=True)]
-        scatter = chart.batch_centroids()
+        moves = [one - other for one, other in zip(chart.centroids, expected, strict=True)]
+        scatter = chart.batch_centroids
     design = np.concatenate(displacements(camera, sub, (chart.down, chart.across))) * units
     design *= slopes.ravel()[:, None]
     both = np.tile(kept, 2)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ommatid.runtime.arrays import FloatArray
 from ommatid.scenes.constants import WHITE
 
+BAR, PAD = 0.046, 0.03  # width of a bar and the gap before it, as shares of a panel's room
 MOST_SHOWN = 480  # rows and columns of a map that a panel of a screen can show
 
 
@@ -85,15 +86,20 @@ def show_map(axes: Any, panel: FigurePanel, most: int = MOST_SHOWN) -> Any:
     )
 
 
-def draw_panel(axes: Any, panel: FigurePanel) -> None:
-    """Draw a panel with its title, with the numbers of rows and columns, and with a bar beside it."""
+def draw_panel(axes: Any, panel: FigurePanel, *, bar: bool = True) -> None:
+    """Draw a panel with its title, with the numbers of rows and columns, and with a bar beside it, or room for one."""
     drawn = show_map(axes, panel)
-    axes.set_title(panel.title, fontsize=10)
+    axes.set_title(panel.title, fontsize=10, y=1.0)  # a place of its own takes a tenth of the time of the figure
     axes.set_xlabel(f"column ({panel.unit})", fontsize=8)
     axes.set_ylabel(f"row ({panel.unit})", fontsize=8)
     axes.tick_params(labelsize=8)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.get_major_locator().set_params(integer=True)
-    bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
-    bar.set_label(panel.scale.label, fontsize=8)
-    bar.ax.tick_params(labelsize=8)
+        axis.get_major_locator().set_params(integer=True, nbins=4)
+    if not bar:
+        place = axes.get_position(original=True)
+        axes.set_position((place.x0, place.y0, place.width * (1 - BAR - PAD), place.height))
+        axes.set_anchor((1.0, 0.5))
+        return
+    drawn_bar = axes.figure.colorbar(drawn, ax=axes, fraction=BAR, pad=PAD)
+    drawn_bar.set_label(panel.scale.label, fontsize=8)
+    drawn_bar.ax.tick_params(labelsize=8)

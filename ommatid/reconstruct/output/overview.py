@@ -46,7 +46,8 @@ def write_overview(
     figure.subplots_adjust(**edges, wspace=0.5, hspace=0.45)
     _write_headline(figure, stack.scene.title, report)
     for index, panel in enumerate(panels):
-        draw_panel(figure.add_subplot(rows, across, 1 + index), panel)
+        first = panel.scale not in [each.scale for each in panels[:index]]
+        draw_panel(figure.add_subplot(rows, across, 1 + index), panel, bar=first)
     _draw_budget(figure.add_subplot(rows, across, (len(panels) + 1, rows * across)), report)
     files.replace(figure, folder / OVERVIEW)
 

@@ -65,7 +65,6 @@ def run(
     """Render, calibrate, reconstruct and report."""
     from ommatid.pipeline import stages
     from ommatid.pipeline.batches import Batch, BatchFiles, batch_members, batch_warnings, run_batch, share_of_job
-    from ommatid.pipeline.time_budget import TimeBudget
 
     detail, (others, figures) = printing.detail, options.formats(formats)
     members, words = share_of_job(jobs.job, batch_members(scenes, folder, sweep, *changes.both), jobs.scheduler)
@@ -73,13 +72,16 @@ def run(
     if dry_run:
         _print_plans(members, force, printing.as_json)
         return
-    run_scene, (cluster, workers) = partial(stages.run, force=force), jobs.pool
+    run_scene, (cluster, workers) = partial(stages.run, force=force, baselines=baselines), jobs.pool
     if within:
         if cluster is not None or workers is not None:
             raise InputError("--within divides the time of one process; leave out --scheduler and --workers")
         folders = [member.folder for member in members]
-        run_scene, workers = TimeBudget(options.seconds(within), folders, STARTED, output.warn, force=force), 1
-    work = stages.SceneWork(run_scene, others, figures, baselines)
+        from ommatid.pipeline.time_budget import TimeBudget
+
+        seconds, workers = options.seconds(within), 1
+        run_scene = TimeBudget(seconds, folders, STARTED, output.warn, force=force, baselines=baselines)
+    work = stages.SceneWork(run_scene, others, figures)
     files = BatchFiles(None if jobs.job else folder, folder, figures)
     with output.batch_bars(len(members), printing.quiet) as bars:
         batch = Batch(work, bars.observer, partial(_print_run, detail, bars))

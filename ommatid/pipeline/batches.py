@@ -11,17 +11,13 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ommatid.analysis.summary import Section
 from ommatid.batch import sweep
 from ommatid.batch.batch import Description, Member, check_files
 from ommatid.batch.remote import RunObserver, SceneOutcome, ScenePackage, Stages, carry_out, outcome_of, packed, unpack
 from ommatid.batch.sweep_row import summary
-from ommatid.batch.sweep_table import lines, write_sweep
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
-from ommatid.page.batch_index import INDEX, cached_index
-from ommatid.page.cached import check_own_page
 from ommatid.runtime.errors import InputError, MachineError, NotStartedError
 from ommatid.runtime.execution.cluster import Cluster, worker_pool
 from ommatid.runtime.outputs.kinds import check_folder
@@ -31,6 +27,9 @@ from ommatid.runtime.progress import Progress, no_progress
 from ommatid.scenes.formats import picture
 
 from .stages import library_versions, open_member
+
+if TYPE_CHECKING:
+    from ommatid.analysis.summary import Section
 
 # Each scene with a function that returns its outcome, or raises its error.
 Runs = Generator[tuple[Member, Callable[[], SceneOutcome]]]
@@ -42,7 +41,7 @@ class BatchOutcome:
     """The results of a batch: a JSON document per scene, the table of a sweep, and the worst exit code."""
 
     documents: list[Description] = field(default_factory=list[Description])
-    sections: list[Section] = field(default_factory=list[Section])
+    sections: list[Section] = field(default_factory=list["Section"])
     exit_code: int = 0
 
 
@@ -59,8 +58,10 @@ class BatchFiles:
         for folder in (self.index, self.sweep):
             if folder is not None:
                 check_folder(folder)
-        if self.index is not None:
-            check_own_page(self.index / INDEX)
+        if self.index is not None and (page := self.index / "index.html").is_file():
+            from ommatid.page.cached import check_own_page
+
+            check_own_page(page)
 
 
 def batch_members(
@@ -260,12 +261,16 @@ def _write_files(
     rows = [summary(document) for member, document in pairs if member.changes]
     folder = (files.sweep if rows else None) or files.index
     with nullcontext() if folder is None or not (rows or folder.is_dir()) else occupied(folder):
-        if rows and files.sweep is not None:
-            write_sweep(files.sweep, rows, files.figures)
         if rows:
+            from ommatid.batch.sweep_table import lines, write_sweep
+
+            if files.sweep is not None:
+                write_sweep(files.sweep, rows, files.figures)
             title = "Sweep" if files.sweep is None else f"Sweep: {files.sweep / 'sweep.csv'}"
             outcome.sections.append((title, lines(rows)))
         if files.index is not None:
+            from ommatid.page.batch_index import cached_index
+
             try:
                 cached_index(files.index, {member.folder: failures.get(member.folder, "") for member in members})
             except Exception as error:

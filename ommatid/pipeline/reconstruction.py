@@ -36,7 +36,7 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.stack import Stack
 from ommatid.scenes.tables import toml
 
-from .stages import StageResults, add_baselines, calibrated_model, earlier_report, finish, write_page
+from .stages import StageResults, calibrated_model, earlier_report, finish, with_baselines, write_page
 
 STACK, MODEL = "stack.exr", "model.npz"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".toml", ".json", ".html")
@@ -224,7 +224,8 @@ def report_path(path: Path, output: Path | None, progress: Progress, *, baseline
     missing = dict[str, None]()
     for folder in outcome.folders:
         with occupied(folder):
-            missing[missing_methods(add_baselines(folder, progress).unknowns)] = None
+            compared = finish(with_baselines(StageResults.read(folder), folder, progress), folder, SILENT)
+            missing[missing_methods(compared.unknowns)] = None
     return replace(outcome, warnings=(*outcome.warnings, *filter(None, missing)))
 
 

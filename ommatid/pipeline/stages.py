@@ -7,31 +7,24 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ommatid.batch.batch import RENDERED, Member, check_files, clear_results, prepare
 from ommatid.batch.remote import RunObserver, Stages
 from ommatid.figures.saving import SCREEN_PNG, FigureFiles
-from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.estimate_formats import Format, write_formats
-from ommatid.reconstruct.output.run_json import PAGE, RunReport, TimeReport
 from ommatid.runtime.errors import InputError, naming_source
 from ommatid.runtime.machine import one_thread
 from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import Progress, no_progress
 from ommatid.runtime.versions import versions
-from ommatid.scenes import model_file
-from ommatid.scenes import stack as stack_file
-from ommatid.scenes.model import Model
 from ommatid.scenes.scene import Scene, read
 from ommatid.scenes.setup import Setup
-from ommatid.scenes.stack import Stack
-from ommatid.scenes.tables.gallery import find_scene
-from ommatid.simulate.calibrate import cached_model, is_adaptive
-from ommatid.simulate.render import cached_stack
-from ommatid.simulate.renderer.variant import check_transport_variant
-from ommatid.simulate.renderer.variant import choose as choose_variant
-from ommatid.simulate.validation import check_scene, check_scene_memory
+
+if TYPE_CHECKING:
+    from ommatid.reconstruct.output.estimate_formats import Format
+    from ommatid.reconstruct.output.run_json import RunReport
+    from ommatid.scenes.model import Model
+    from ommatid.scenes.stack import Stack
 
 
 @dataclass(frozen=True)
@@ -45,6 +38,10 @@ class StageResults:
     @classmethod
     def read(cls, folder: Path) -> StageResults:
         """Read those of a finished run. Raises InputError."""
+        from ommatid.reconstruct.output import run_json
+        from ommatid.scenes import model_file
+        from ommatid.scenes import stack as stack_file
+
         return cls(run_json.read(folder), stack_file.read(folder / "stack.exr"), model_file.read(folder / "model.npz"))
 
 
@@ -69,98 +66,107 @@ def open_member(member: Member) -> Setup:
     return checked_setup(member.content)
 
 
-def run(setup: Setup, folder: Path, observer: RunObserver, force: bool = False) -> dict[str, Any]:
+def run(
+    setup: Setup, folder: Path, observer: RunObserver, force: bool = False, baselines: bool = False
+) -> dict[str, Any]:
     """Execute all stages of a scene, here or on a worker, and return the content of run.json.
 
-    force : True to make again what is up to date
+    force : True to make again what is up to date;  baselines : True to compare with other methods
     """
-    return finish(results(setup, folder, observer, force), folder, observer).plain()
+    return finish(results(setup, folder, observer, force), folder, observer, baselines).plain()
 
 
 @dataclass(frozen=True)
 class SceneWork:
     """Stages, and what else is done with a scene, even if its results are up to date, by one process at a time.
 
-    formats : of the estimate;  figures : files of the figures;  baselines : True to compare with other methods
+    formats : of the estimate;  figures : files of the figures
     A scene that is refused before it is rendered leaves nothing in its folder.
     """
 
     stages: Stages
     formats: tuple[Format, ...] = ()
     figures: FigureFiles = SCREEN_PNG
-    baselines: bool = False
 
     def __call__(self, setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
         """Do the work, here or on a worker, and return the description."""
         with occupied(folder, RENDERED):
             description = self.stages(setup, folder, observer)
-            if self.baselines:
-                with observer.progress("baselines") as progress:
-                    description = add_baselines(folder, progress).plain()
             if self.figures != SCREEN_PNG:
                 write_figures(folder, self.figures)
-            write_formats(folder / "estimate.exr", self.formats)
+            if self.formats:
+                from ommatid.reconstruct.output.estimate_formats import write_formats
+
+                write_formats(folder / "estimate.exr", self.formats)
             return description
 
 
 def write_figures(folder: Path, figures: FigureFiles) -> None:
     """Write the figures of a finished run in these files. Raises InputError or MachineError."""
     from ommatid.analysis.depth_error import PICTURE, draw
+    from ommatid.reconstruct.output import run_json
     from ommatid.reconstruct.output.overview import write_overview
     from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
+    from ommatid.scenes.stack import read
 
-    report, stack = run_json.read(folder), stack_file.read(folder / "stack.exr")
+    report, stack = run_json.read(folder), read(folder / "stack.exr")
     write_overview(folder, stack, read_estimate(folder / ESTIMATE).channels, report, figures)
     if report.depth:
         draw(folder / PICTURE, stack.camera, report.depth, files=figures)
 
 
-def add_baselines(folder: Path, progress: Progress) -> RunReport:
-    """Compare a finished run with other methods, and return run.json, which is written with the page if it changes.
-
-    Raises InputError where the truth is not known.
-    """
+def with_baselines(results: StageResults, folder: Path, progress: Progress) -> StageResults:
+    """Compare results with other methods, unless they were. Raises InputError where the truth is not known."""
     from ommatid.analysis.baselines import cached_baselines
-    from ommatid.batch.remote import SILENT
     from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
 
     truth = read_estimate(folder / ESTIMATE).channels.get("truth")
     if truth is None:
         raise InputError(f"{folder}: --baselines compares with the truth, which is not known here; leave it out")
-    results = StageResults.read(folder)
     report, files = results.report, (results.stack, results.model)
-    cached_baselines(folder, report.fingerprint, *files, truth.astype("float64"), progress)
-    return finish(results, folder, SILENT)
+    found = cached_baselines(folder, report.fingerprint, *files, truth.astype("float64"), progress)
+    return replace(results, report=report.with_changes(baselines=found.reports))
 
 
 def check_run(setup: Setup, folder: Path) -> None:
     """Raise InputError for what would stop a run of a scene after some work. Nothing is written."""
     from ommatid.analysis.study import check_study
     from ommatid.reconstruct.method_choice import choose_method
+    from ommatid.simulate.renderer.variant import check_transport_variant, choose
+    from ommatid.simulate.validation import check_scene
 
     scene, camera = setup.scene, setup.camera
     check_scene(setup)
     if scene.study is not None and "transport" in scene.study.models:
         with naming_source(scene.source):
-            check_transport_variant(choose_variant(scene.render.variant), "study.models")
+            check_transport_variant(choose(scene.render.variant), "study.models")
     choose_method(scene, camera, setup.is_applied)  # checks the memory before any work
     check_study(scene, camera)
     check_files(setup, folder)
 
 
-@one_thread()
 def results(setup: Setup, folder: Path, observer: RunObserver, force: bool = False) -> StageResults:
     """Execute all stages of a scene but write neither its page nor run.json; force : to make them all again."""
-    from ommatid.analysis.calibration_goal import for_stack
-    from ommatid.reconstruct.output.result_files import cached_results
-
-    scene, camera = setup.scene, setup.camera
-    check_run(setup, folder)
+    with observer.progress("check"):
+        check_run(setup, folder)
     if force:
         clear_results(folder, setup)
+    return _computed(setup, folder, observer)
+
+
+@one_thread()
+def _computed(setup: Setup, folder: Path, observer: RunObserver) -> StageResults:
+    """Render, calibrate and reconstruct."""
+    from ommatid.reconstruct.output.result_files import cached_results
+    from ommatid.reconstruct.output.run_json import TimeReport
+
+    scene, camera = setup.scene, setup.camera
     start_up, begun = None if observer.start_up is None else observer.start_up(), perf_counter()
     stack, rendered = _rendered(setup, folder, observer)
     with observer.progress("calibrate") as progress:
+        from ommatid.analysis.calibration_goal import for_stack
+        from ommatid.simulate.calibrate import cached_model
+
         model, calibrated = cached_model(folder / "model.npz", setup, progress, for_stack(stack))
     observer.done("calibrate", calibrated)
     with observer.progress("reconstruct") as progress:
@@ -183,20 +189,24 @@ def results(setup: Setup, folder: Path, observer: RunObserver, force: bool = Fal
     return StageResults(report, stack, model)
 
 
-def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunReport:
-    """Write the page and run.json of results, with the baselines beside them, unless both are up to date.
+def finish(results: StageResults, folder: Path, observer: RunObserver, baselines: bool = False) -> RunReport:
+    """Write the page and run.json of results, with the baselines beside them, unless they are up to date.
 
+    baselines : True to compare them with other methods first
     Returns the content of run.json.
     """
     from ommatid.analysis.baselines import known_baselines
+    from ommatid.reconstruct.output import run_json
 
+    if baselines:
+        with observer.progress("baselines") as progress:
+            results = with_baselines(results, folder, progress)
+    elif (known := known_baselines(folder, results.report.fingerprint)) is not None:
+        results = replace(results, report=results.report.with_changes(baselines=known.reports))
     begun, report = perf_counter(), results.report
-    known = known_baselines(folder, report.fingerprint)
-    if known is not None:
-        report = report.with_changes(baselines=known.reports)
-    write_page(replace(results, report=report), folder, observer)
-    if PAGE not in report.stages:
-        report = report.with_stage(PAGE, perf_counter() - begun)
+    write_page(results, folder, observer)
+    if run_json.PAGE not in report.stages:
+        report = report.with_stage(run_json.PAGE, perf_counter() - begun)
     earlier = earlier_report(folder, report.fingerprint)
     if earlier is None or report.plain() != earlier.plain():
         run_json.write(folder, report)
@@ -205,6 +215,8 @@ def finish(results: StageResults, folder: Path, observer: RunObserver) -> RunRep
 
 def earlier_report(folder: Path, fingerprint: str) -> RunReport | None:
     """Return the content of run.json if it is of the estimate with this fingerprint."""
+    from ommatid.reconstruct.output import run_json
+
     with suppress(OSError, ValueError, InputError):
         report = run_json.read(folder)
         return report if report.fingerprint == fingerprint else None
@@ -222,6 +234,8 @@ def write_page(results: StageResults, folder: Path, observer: RunObserver) -> No
 
 def render(setup: Setup, folder: Path, observer: RunObserver, force: bool = False) -> dict[str, Any]:
     """Render a scene, here or on a worker, and describe its stack; force : to render it again."""
+    from ommatid.simulate.validation import check_scene
+
     check_scene(setup, calibrates=False)
     check_files(setup, folder)
     if force:
@@ -246,6 +260,9 @@ def calibrated_model(setup: Setup, path: Path, progress: Progress, stack: Stack 
 
     An adaptive calibration stops by the expected error of `stack`, without one by that of images drawn from the prior.
     """
+    from ommatid.simulate.calibrate import cached_model, is_adaptive
+    from ommatid.simulate.validation import check_scene, check_scene_memory
+
     if setup.scene.calibration.method != "ideal":
         check_scene(setup)
     check_scene_memory(setup)
@@ -263,6 +280,7 @@ def export_scene(path: Path, output: Path, changes: Sequence[str] = (), lenses: 
     Raises InputError for a scene with a world or with lenses that are more than pinholes.
     """
     from ommatid.runtime.outputs.kinds import check_output
+    from ommatid.scenes.tables.gallery import find_scene
     from ommatid.simulate.renderer.plugins import export
 
     check_output(output, find_scene(path))
@@ -278,15 +296,19 @@ def library_versions(with_variant: bool) -> dict[str, str]:
 
     with_variant : True adds the variant that 'auto' selects
     """
+    from ommatid.simulate.renderer.variant import choose
+
     required = versions("mitsuba", "drjit", "scipy")
     if with_variant:
-        required["the variant that render.variant 'auto' stands for"] = choose_variant("auto")
+        required["the variant that render.variant 'auto' stands for"] = choose("auto")
     return required
 
 
 def _rendered(setup: Setup, folder: Path, observer: RunObserver) -> tuple[Stack, bool]:
     prepare(setup, folder)
     with observer.progress("render") as progress:
+        from ommatid.simulate.render import cached_stack
+
         stack, made = cached_stack(folder / "stack.exr", setup, progress)
     observer.done("render", made)
     return stack, made

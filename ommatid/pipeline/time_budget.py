@@ -46,7 +46,7 @@ class TimeBudget:
     fails leaves its share to the others.
 
     folders : of the scenes, in the order in which they are run;  say : takes a message if a run took longer
-    force : True to make again what is up to date
+    force : True to make again what is up to date;  baselines : True to compare with other methods, in further time
     """
 
     seconds: float
@@ -55,6 +55,7 @@ class TimeBudget:
     say: Callable[[str], None]
     clock: Clock = perf_counter
     force: bool = False
+    baselines: bool = False
 
     def __call__(self, setup: Setup, folder: Path, observer: RunObserver) -> dict[str, Any]:
         """Run a scene, and return its description; a repeated run is known by the request, as shares vary."""
@@ -65,7 +66,7 @@ class TimeBudget:
         earlier = None if force else _earlier_run(folder, setup, request)
         if earlier is not None:
             results = stages.results(_with_samples(setup, *_samples_of(earlier)), folder, observer)
-            return _finished(results, earlier, folder, observer)
+            return self._finished(results, earlier, folder, observer)
         samples: tuple[Samples, Samples] = (FEW, FEW)
         page = 0.0
         while True:
@@ -89,12 +90,14 @@ class TimeBudget:
             self.say(f"{folder}: took {total:.1f} s of {seconds:g} s with {counts}")
         chosen: dict[str, Samples] = dict(zip(KEYS, samples, strict=True))
         limit = {"within": seconds, "asked": request, "seconds": total, "chosen": chosen}
-        return _finished(results, results.report.spent.model_copy(update=limit), folder, observer)
+        return self._finished(results, results.report.spent.model_copy(update=limit), folder, observer)
 
-
-def _finished(results: StageResults, spent: TimeReport, folder: Path, observer: RunObserver) -> dict[str, Any]:
-    """Write page and run.json of results with these times, and return the content of run.json."""
-    return finish(replace(results, report=results.report.with_changes(spent=spent)), folder, observer).plain()
+    def _finished(
+        self, results: StageResults, spent: TimeReport, folder: Path, observer: RunObserver
+    ) -> dict[str, Any]:
+        """Write page and run.json of results with these times, and return the content of run.json."""
+        timed = replace(results, report=results.report.with_changes(spent=spent))
+        return finish(timed, folder, observer, self.baselines).plain()
 
 
 def _more_samples(

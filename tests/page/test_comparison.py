@@ -10,15 +10,15 @@ import pytest
 
 from ommatid.analysis import baselines
 from ommatid.analysis.baselines import BASELINES, known_baselines
+from ommatid.batch.remote import SILENT
 from ommatid.page import comparison
 from ommatid.page.comparison import difference_words, scene_differences, write_comparison
 from ommatid.page.data import Run, read_run
 from ommatid.page.sections import page
-from ommatid.pipeline.stages import add_baselines
+from ommatid.pipeline.stages import StageResults, finish
 from ommatid.reconstruct.output import run_json
-from ommatid.reconstruct.output.run_json import IntervalReport, VerdictReport
+from ommatid.reconstruct.output.run_json import IntervalReport, RunReport, VerdictReport
 from ommatid.runtime.errors import InputError
-from ommatid.runtime.progress import no_progress
 from ommatid.scenes import model_file, stack
 
 from .runs import letter_run
@@ -105,9 +105,15 @@ def test_a_page_shows_two_runs(run: Run, tmp_path: Path) -> None:
     assert path.name == comparison.COMPARISON
 
 
+def compared(run: Run) -> RunReport:
+    """The content of run.json of a finished run, compared with other methods."""
+    results = StageResults(run_json.read(run.folder), run.stack, run.model)
+    return finish(results, run.folder, SILENT, baselines=True)
+
+
 def test_baselines_are_in_run_json_and_on_the_page(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "find_spec", lambda _: None)  # total variation has its own tests
-    report = add_baselines(run.folder, no_progress)
+    report = compared(run)
     assert [each.method for each in report.baselines] == ["single", "rearranged", "shift_and_add"]
     assert run_json.read(run.folder).baselines == report.baselines
     text = page(read_run(run.folder), None, "0")
@@ -117,11 +123,11 @@ def test_baselines_are_in_run_json_and_on_the_page(run: Run, monkeypatch: pytest
     assert "Pixel rearrangement" in text
     assert known_baselines(run.folder, "another") is None
     written = (run.folder / BASELINES).stat().st_mtime_ns
-    assert add_baselines(run.folder, no_progress) == report
+    assert compared(run) == report
     assert (run.folder / BASELINES).stat().st_mtime_ns == written
 
 
 def test_baselines_need_the_truth(tmp_path: Path) -> None:
-    letter_run(tmp_path, truth=False)
+    run = letter_run(tmp_path, truth=False)
     with pytest.raises(InputError, match="--baselines compares with the truth, which is not known here"):
-        add_baselines(tmp_path, no_progress)
+        compared(run)

@@ -23,7 +23,6 @@ from ommatid.reconstruct.restore import check_camera
 from ommatid.result import Reconstructor
 from ommatid.runtime.arrays import FloatArray, as_numbers
 from ommatid.runtime.errors import InputError, MachineError, naming_source
-from ommatid.runtime.outputs.occupied import occupied
 from ommatid.runtime.progress import no_progress
 from ommatid.scenes import model_file
 from ommatid.scenes import scene as scene_file
@@ -210,9 +209,7 @@ def run(scene: Scene | str | Path, folder: str | Path) -> Result:
 
     Raises InputError for a wrong scene, MachineError for a full disk.
     """
-    setup = _setup(scene)
-    with occupied(Path(folder), "stack.exr"):
-        stages.run(setup, Path(folder), SILENT)
+    stages.SceneWork(stages.run)(_setup(scene), Path(folder), SILENT)
     return read_result(folder)
 
 

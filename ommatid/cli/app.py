@@ -8,6 +8,7 @@ NumPy or more are imported inside the commands, so that `ommatid --help` answers
 from __future__ import annotations
 
 import codecs
+import gc
 import io
 import os
 import sys
@@ -79,6 +80,7 @@ def main() -> None:
     use_utf8_names()
     with command_line(["ommatid", *sys.argv[1:]]), library_caches(), library_warnings(output.warn):
         code = exit_code_of(_run)
+    gc.freeze()  # the process ends: looking for cycles among the libraries' objects would take half a second
     sys.exit(code)
 
 

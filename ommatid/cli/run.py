@@ -34,6 +34,7 @@ from .options import (
 )
 
 if TYPE_CHECKING:
+    from ommatid.analysis.summary import Section
     from ommatid.batch.batch import Member
 
 NoRays = Annotated[bool, typer.Option("--no-rays", help="A perfect H and a perfect rendering: Eq. 5 without rays.")]
@@ -93,16 +94,20 @@ def _print_run(
     detail: output.Detail | None, bars: output.Bars, member: Member, description: dict[str, Any]
 ) -> dict[str, Any]:
     """Print a finished scene, unless `detail` is None, and return its description."""
-    from ommatid.pipeline.sections import run_sections
+    if detail is None:
+        return description
     from ommatid.reconstruct.output.run_json import RunReport
 
-    if detail is not None:
-        report = RunReport.model_validate(description)
-        page, sections = member.folder / "report.html", run_sections(member.folder, description)
-        with bars.hidden():
-            output.print_report(member.folder.name, page, report, sections, detail)
-            if detail == "summary" and report.study:  # asked for by the scene
-                output.print_tables(sections[-1:])
+    report = RunReport.model_validate(description)
+    sections: list[Section] = []
+    if detail == "table" or report.study:
+        from ommatid.pipeline.sections import run_sections
+
+        sections = run_sections(member.folder, report)
+    with bars.hidden():
+        output.print_report(member.folder.name, member.folder / "report.html", report, sections, detail)
+        if detail == "summary" and report.study:  # asked for by the scene
+            output.print_tables(sections[-1:])
     return description
 
 

@@ -28,9 +28,8 @@ from ommatid.simulate.renderer import variant
 from .batches import BatchOutcome
 
 
-def run_sections(folder: Path, description: dict[str, Any]) -> list[Section]:
-    """Tabulate the description of a finished run in `folder`."""
-    report = RunReport.model_validate(description)
+def run_sections(folder: Path, report: RunReport) -> list[Section]:
+    """Tabulate the results of a finished run in `folder`."""
     sections: list[Section] = [(f"{printable(report.title or folder.name)}: {folder}", facts.rows(report))]
     if report.depth:
         sections.append(("Error against distance", depth_error.rows(report.depth)))

@@ -89,7 +89,7 @@ def show_map(axes: Any, panel: FigurePanel, most: int = MOST_SHOWN) -> Any:
 def draw_panel(axes: Any, panel: FigurePanel, *, bar: bool = True) -> None:
     """Draw a panel with its title, with the numbers of rows and columns, and with a bar beside it, or room for one."""
     drawn = show_map(axes, panel)
-    axes.set_title(panel.title, fontsize=10, y=1.0)  # a place of its own takes a tenth of the time of the figure
+    axes.set_title(panel.title, fontsize=10)
     axes.set_xlabel(f"column ({panel.unit})", fontsize=8)
     axes.set_ylabel(f"row ({panel.unit})", fontsize=8)
     axes.tick_params(labelsize=8)

@@ -43,17 +43,12 @@ class FigureFiles:
 
     formats: tuple[str, ...] = ("png",)
 
-    def paths(self, path: Path) -> list[Path]:
-        """Return the files of a figure, one per format; the suffix of `path` is replaced."""
-        return [path.with_suffix(f".{name}") for name in self.formats]
-
-    def save(self, figure: Any, path: Path) -> None:
-        """Write a figure in every format. Raises InputError or MachineError."""
-        save_figure(figure, path, self.formats)
-
     def replace(self, figure: Any, path: Path) -> None:
-        """Write a figure in every format, and remove its files in others, which show something older."""
-        self.save(figure, path)
+        """Write a figure in every format, and remove its files in others, which show something older.
+
+        Raises InputError or MachineError.
+        """
+        save_figure(figure, path, self.formats)
         for name in set(FORMATS) - set(self.formats):
             path.with_suffix(f".{name}").unlink(missing_ok=True)
 

@@ -41,7 +41,7 @@ GROUPS = 12
 FEWEST_PIXELS = 20  # per group, on average
 CONFIDENCE = 0.99
 LOG_RATIO = 10  # ratio of the largest to the smallest error from which on the axes are logarithmic
-Point = tuple[float, float]  # run time of a stage, and mean squared error of the image
+Point = tuple[float, float]  # run time of a stage and mean squared error of the image, or the ends of an axis
 
 
 @dataclass(frozen=True)
@@ -60,18 +60,20 @@ class ChartSeries:
     high: Sequence[float] = ()
 
 
-@dataclass(frozen=True)
-class ChartAxis:
-    """Label with its unit, scale, and ends; None: as the values ask."""
-
-    label: str
-    logarithmic: bool = False
-    ends: tuple[float, float] | None = None
-
-
 @own_style()
-def chart(name: str, x: ChartAxis, y: ChartAxis, series: Sequence[ChartSeries], description: str) -> Markup:
-    """Return a chart as an SVG element; name : unique on its page;  description : for readers who do not see it."""
+def chart(
+    name: str,
+    labels: tuple[str, str],
+    series: Sequence[ChartSeries],
+    description: str,
+    ends: tuple[Point | None, Point | None] = (None, None),
+    logarithmic: bool = False,
+) -> Markup:
+    """Return a chart as an SVG element.
+
+    name : unique on its page;  description : for readers who do not see it
+    labels, ends : of the axes along x and y, with units, None for ends as the values ask;  logarithmic : both axes
+    """
     figure = new_figure(*SIZE)
     panel = figure.subplots()
     named = sum(bool(part.name) for part in series)
@@ -81,18 +83,14 @@ def chart(name: str, x: ChartAxis, y: ChartAxis, series: Sequence[ChartSeries], 
         if part.low:
             panel.vlines(part.x, part.low, part.high, color=colour, linewidth=5, alpha=0.3)
         panel.plot(part.x, part.y, color=colour, label=printable_label(part.name), **LOOKS[part.look])
-    panel.set(xlabel=x.label, ylabel=y.label, xscale=_scale(x), yscale=_scale(y), xlim=x.ends, ylim=y.ends)
-    for axis, side in ((x, panel.xaxis), (y, panel.yaxis)):
-        if axis.logarithmic:
-            log_ticks(side)
+    scale = "log" if logarithmic else "linear"
+    panel.set(xlabel=labels[0], ylabel=labels[1], xscale=scale, yscale=scale, xlim=ends[0], ylim=ends[1])
+    for axis in (panel.xaxis, panel.yaxis) if logarithmic else ():
+        log_ticks(axis)
     panel.grid(color=GREY, alpha=0.25)
     if named:  # above the panel, where it covers no points
         panel.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(-0.02, 0.99))
     return Markup(svg_text(figure, f"chart-{name}", description))
-
-
-def _scale(axis: ChartAxis) -> str:
-    return "log" if axis.logarithmic else "linear"
 
 
 @dataclass(frozen=True)
@@ -167,8 +165,8 @@ def error_chart(groups: list[ErrorGroup]) -> Markup:
         high=[high for _, high in intervals],
     )
     equal = ChartSeries("measured equals predicted", ends, ends, "dashed", 0)
-    x, y = (ChartAxis(f"{name} RMS error of a pixel", logarithmic) for name in ("predicted", "measured"))
-    return chart("errors", x, y, [equal, dots], error_words(groups))
+    labels = "predicted RMS error of a pixel", "measured RMS error of a pixel"
+    return chart("errors", labels, [equal, dots], error_words(groups), logarithmic=logarithmic)
 
 
 def error_words(groups: list[ErrorGroup]) -> str:
@@ -199,8 +197,8 @@ def resolution_content(run: Run, model: Model, window: ErrorWindow | None, singl
     if sub is not None:
         name = "a pixel of the single sub-image"
         series.append(ChartSeries(name, list(sub.frequencies), list(sub.horizontal), "line", 2))
-    axes = ChartAxis("cycles per pixel", ends=(0.0, 0.5)), ChartAxis("contrast kept", ends=(0.0, 1.1))
-    drawn = chart("transfer", *axes, series, "contrast of waves in the estimate, by frequency")
+    labels, ends = ("cycles per pixel", "contrast kept"), ((0.0, 0.5), (0.0, 1.1))
+    drawn = chart("transfer", labels, series, "contrast of waves in the estimate, by frequency", ends)
     words = transfer_words(found, run.stack.camera.target_pitch)
     return {"transfer": drawn, "transfer_words": words, "left_out": left_out}
 
@@ -242,8 +240,8 @@ def time_curves(run: Run, bench: BenchTable | None) -> tuple[Markup | str, str]:
     words = f"The mean squared error of this run is {mse:.4g}."
     if bench.recommended.why:
         words += f" Recommendation of the bench: {bench.recommended.why.removesuffix('.')}."
-    axes = ChartAxis("time of the stage (s)", True), ChartAxis("mean squared error", True)
-    return chart("effort", *axes, series, words), words
+    labels = "time of the stage (s)", "mean squared error"
+    return chart("effort", labels, series, words, logarithmic=True), words
 
 
 def _columns(points: list[Point]) -> tuple[list[float], list[float]]:

@@ -121,7 +121,7 @@ def test_figures_are_written_in_every_format_and_the_same_again(tmp_path: Path) 
         folder.mkdir()
         figure: Any = Figure(figsize=(2, 2))
         figure.subplots().plot([1, 2], label="a")
-        FigureFiles(("png", "svg", "pdf")).save(figure, folder / "camera.png")
+        FigureFiles(("png", "svg", "pdf")).replace(figure, folder / "camera.png")
     assert {path.name for path in (tmp_path / "a").iterdir()} == {f"camera.{name}" for name in kinds}
     for name, start in kinds.items():
         content = (tmp_path / "a" / f"camera.{name}").read_bytes()

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ommatid.analysis.baselines import known_baselines
-from ommatid.reconstruct.measured_error import best_single_sub_image, enlarged
+from ommatid.reconstruct.measured_error import enlarged
 from ommatid.reconstruct.output import run_json
 from ommatid.reconstruct.output.overview import sub_image_of
 from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
@@ -151,10 +151,8 @@ class ShownSubImage:
         return f"{'Best single' if self.is_best else 'Single'} sub-image ({self.name}, bicubic)"
 
 
-def shown_sub_image(stack: Stack, truth: FloatArray | None) -> ShownSubImage:
+def shown_sub_image(run: Run) -> ShownSubImage:
     """Return the best sub-image, or without the truth the central one of the type with the finest pixels."""
-    best = best_single_sub_image(stack, truth)
-    if best is not None:
-        return ShownSubImage(best.name, best.image, True)
-    camera, (sub, pixels) = stack.camera, sub_image_of(stack)
-    return ShownSubImage(sub.name, enlarged(camera, sub, pixels, np.arange(float(camera.rows))), False)
+    camera, best = run.stack.camera, run.report.single
+    sub, pixels = sub_image_of(run.stack, best and best.sub_imager)
+    return ShownSubImage(sub.name, enlarged(camera, sub, pixels, np.arange(float(camera.rows))), best is not None)

@@ -44,8 +44,7 @@ def page(run: Run, bench: BenchTable | None, stamp: str) -> str:
     bench : results of `ommatid bench` for the camera
     stamp : fingerprint of the content, by which an up-to-date page is recognised
     """
-    truth = None if run.truth is None else run.truth.astype(np.float64)
-    single = shown_sub_image(run.stack, truth)
+    single = shown_sub_image(run)
     model = model_of_f(run.model, run.stack.camera, PriorTable())
     window = error_window(run.stack, model, run.estimate.astype(np.float64), run.report)
     curves, curve_words = charts.time_curves(run, bench)

@@ -10,10 +10,9 @@ as many as linear interpolation between them needs.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
-from math import ceil, pi
+from functools import cached_property, lru_cache
+from math import pi
 from typing import ClassVar
 
 import numpy as np
@@ -180,42 +179,14 @@ class Optics(ABC):
         cell, widest = min(cell for cell, _ in grids), min(half for _, half in grids) * MOST_WIDER
         return cell, min(max(half for _, half in grids), widest)
 
-    @cached_property
-    def steps(self) -> tuple[int, int]:
-        """Steps of height over the field, and of direction over a right angle, that change less than the tolerance."""
-        _, waves = self.nodes
-        axis, rim = (point_spread(wave, self.grid).values for wave in (waves[0], waves[-1]))
-        variation = np.abs(rim - axis).sum(), np.abs(rim - rim.T).sum()
-        return ceil(variation[0] / TOLERANCE), ceil(variation[1] / TOLERANCE)
-
-    def _beside(self, height: float) -> list[tuple[int, float]]:
-        """Return the numbers of the nodes beside a height, and their weights."""
-        heights = self.nodes[0]
+    def between(self, height: float) -> list[tuple[Wavefront, float]]:
+        """Return the waves of the nodes beside a height, and their weights: its wave, interpolated."""
+        heights, waves = self.nodes
         if heights.size == 1 or height >= heights[-1]:
-            return [(heights.size - 1, 1.0)]
+            return [(waves[-1], 1.0)]
         after = int(np.searchsorted(heights, height, side="right"))
         share = float((height - heights[after - 1]) / (heights[after] - heights[after - 1]))
-        return [(after - 1, 1 - share), (after, share)]
-
-    def between(self, height: float) -> list[tuple[Wavefront, float]]:
-        """Return the waves of the nodes beside a height, and their weights."""
-        return [(self.nodes[1][node], share) for node, share in self._beside(height)]
-
-    def spreads(self, angle: float) -> Callable[[float], FloatArray]:
-        """Return the point-spread function by the height of a sensor point, on the grid: (n, n) shares of the light.
-
-        angle : from the y axis to the sensor point, towards x; one function for all heights computes each node once
-        """
-
-        @cache
-        def of_node(node: int) -> FloatArray:
-            return point_spread(self.nodes[1][node].turned(-angle), self.grid).values
-
-        def spread(height: float) -> FloatArray:
-            parts = [share * of_node(node) for node, share in self._beside(height)]
-            return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
-
-        return spread
+        return [(waves[after - 1], 1 - share), (waves[after], share)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,9 +24,8 @@ from ..camera import Camera
 from ..fitted.kernel_shapes import KernelShapes
 from ..fitted.kernels import KernelFootprints, KernelPlaces, basis, terms
 from ..lens_type import LensType
-from .field import FINEST, Optics, bands, check_waves, light_reach, optics_of
-from .lens_matrix import blur_of, edges_at, matrix, row_by_rays, row_by_waves
-from .point_spread import point_spread
+from .field import light_reach
+from .lens_matrix import Bands, edges_at, matrix, optics_by_band, row_at
 
 # Nodes along a side of a quadrant, and degrees for them.
 CHARTS = {1: (0, 1), 3: (2, 4), 5: (6,), 7: (8, 10), 12: (12, 14, 16)}
@@ -43,35 +42,15 @@ class _FieldRows:
     """Rows of H of a lens type at any position of its field, on W x W pixels of f."""
 
     places: KernelPlaces
-    fields: tuple[tuple[Optics, float], ...]
+    fields: Bands
 
     def at(self, u: float, v: float) -> FloatArray:
         """Return the row at (u, v) of the field: (W, W)."""
-        beside = np.array([u, v]) * self.places.scale
-        total, light = np.zeros((self.places.width, self.places.width)), 0.0
-        for field, weight in self.fields:
-            x, y = beside[::-1] * self._pitch
-            lit = weight * float(field.weight(np.array([np.hypot(x, y)]))[0])
-            if lit > 0:
-                total += lit * self._row(field, float(x), float(y), beside)
-            light += lit
-        return total / light if light > 0 else total
-
-    @property
-    def _pitch(self) -> float:
-        """Distance on the sensor per pixel of f."""
-        camera = self.places.camera
-        return camera.target_pitch * camera.optical_magnification(self.places.lens_type)
-
-    def _row(self, field: Optics, x: float, y: float, beside: FloatArray) -> FloatArray:
         camera, lens_type, wide = self.places.camera, self.places.lens_type, self.places.width
-        edges = tuple(edges_at(camera, field, lens_type, np.array(x), np.array(y)) - (beside - wide / 2)[:, None])
-        blur, pitch, height = blur_of(camera, lens_type), camera.target_pitch, float(np.hypot(x, y))
-        angle = float(np.arctan2(-x, y))
-        if field.rays_suffice:
-            return row_by_rays(field.rays(height, FINEST * pitch).turned(angle), pitch, edges, blur, (wide, wide))
-        spread = point_spread(field.lit_wave(height).turned(angle), field.grid)
-        return row_by_waves(spread.values, spread.cell / pitch, edges, blur, (wide, wide))
+        down, across = beside = np.array([u, v]) * self.places.scale
+        pitch = camera.target_pitch * camera.optical_magnification(lens_type)  # on the sensor, per pixel of f
+        place = float(across * pitch), float(down * pitch)
+        return row_at(camera, lens_type, self.fields, place, wide / 2 - beside, (wide, wide))
 
     def chart(self, nodes: FloatArray, *, ends: bool) -> tuple[FloatArray, FloatArray]:
         """Return pairs of u and v in a quadrant, (pairs, 2), and the rows there, (pairs, W^2).
@@ -97,9 +76,7 @@ def kernels(camera: Camera, lens_type: LensType) -> KernelFootprints:
     Expects a camera for which `Camera.has_kernel` is true. Raises InputError if surfaces form no image, if kernels do
     not hold the variation over the field to the tolerance, and as `light_reach` does.
     """
-    fields = tuple((optics_of(camera, lens_type, wavelength), weight) for wavelength, weight in bands(camera))
-    for field, _ in fields:
-        check_waves(lens_type, field)
+    fields = optics_by_band(camera, lens_type)
     rows = _FieldRows(KernelPlaces(camera, lens_type, _margin(camera, lens_type, fields)), fields)
     cells = rows.places.width**2
     check_memory(
@@ -131,7 +108,7 @@ def blurred_matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     return matrix(camera, lens_type)
 
 
-def _margin(camera: Camera, lens_type: LensType, fields: tuple[tuple[Optics, float], ...]) -> int:
+def _margin(camera: Camera, lens_type: LensType, fields: Bands) -> int:
     """Return by how many pixels of f light reaches beyond a footprint, distortion included."""
     places = KernelPlaces(camera, lens_type, 0)
     corner = np.array(places.extent) * places.scale

@@ -14,44 +14,30 @@ point-spread functions are convolved on their grid. Its deviation is in proporti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from itertools import groupby
 from math import ceil, pi
 
 import numpy as np
 from scipy import fft, ndimage, sparse
 from scipy.special import ndtr, sici
 
-from ommatid.runtime.arrays import FloatArray, IntArray
+from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.machine import check_memory
 
 from ..camera import Camera
 from ..constants import DEVIATIONS
 from ..lens_type import LensType
 from ..pose import pixel_middles, pose_of
-from .field import Optics, bands, check_waves, optics_of
+from .field import FINEST, Optics, bands, check_waves, optics_of
+from .point_spread import point_spread
 from .wavefront import Wavefront
 
 SAME = 6  # digits of edges of footprints, which pixels of a row share
 LEAST = 1e-12  # entries below are left out
 ENTRY = 16  # bytes
 
-
-@dataclass(frozen=True, eq=False)
-class _PixelFootprints:
-    """Sensor pixels of a lens type, in the order of measurements.
-
-    x, y : (M,) middle, mm from the lens's axis;  rows, columns : (M, 2) edges of the footprint
-    blur : standard deviation of the pixels' blur over the sides of their open part, down and across
-    """
-
-    x: FloatArray
-    y: FloatArray
-    rows: FloatArray
-    columns: FloatArray
-    blur: tuple[float, float]
+Bands = tuple[tuple[Optics, float], ...]
 
 
 @lru_cache(maxsize=4)
@@ -63,34 +49,83 @@ def matrix(camera: Camera, lens_type: LensType) -> sparse.csr_array:
     variation of the blur within a pixel.
     Raises InputError if the surfaces form no image, or aberrations of too many waves.
     """
-    parts = (_band(camera, lens_type, wavelength, weight) for wavelength, weight in bands(camera))
-    entries, total = next(parts)
-    for more, light in parts:
-        entries, total = sparse.csr_array(entries + more), total + light
-    scale = np.divide(float(lens_type.light), total, out=np.zeros_like(total), where=total > 0)
-    return sparse.csr_array(sparse.diags_array(scale) @ entries)
+    fields = optics_by_band(camera, lens_type)
+    own = max(float(side) for side in lens_type.footprint) + 2 * camera.diffusion(lens_type) * DEVIATIONS
+    far = max(field.reach for field, _ in fields) / camera.target_pitch
+    tall, wide = (min(size, own + 2 * far + 2) for size in camera.shape)
+    needed = int(lens_type.measurements * tall * wide) * ENTRY
+    check_memory(needed, "H of blurred pixels", "crop the target or use fewer sub-imagers")
+    subs = [sub for sub in camera.sub_imagers if sub.type == lens_type]
+    places = np.concatenate([pixel_middles(camera, sub, pose_of(sub)).reshape(-1, 3)[:, :2] for sub in subs]).tolist()
+    axes = [np.array(camera.shape) / 2 - np.array(sub.lens[::-1]) / camera.target_pitch for sub in subs]
+    rows = [sparse.csr_array((1, camera.unknowns))] * len(places)
+    for pixel in sorted(range(len(places)), key=lambda pixel: _folded(*places[pixel])):  # `_spread` keeps few
+        axis, place = axes[pixel * len(subs) // len(places)], (places[pixel][0], places[pixel][1])
+        values = row_at(camera, lens_type, fields, place, axis, camera.shape, interpolates=True)
+        values[values < LEAST] = 0.0
+        rows[pixel] = sparse.csr_array(values.reshape(1, -1))
+    return sparse.csr_array(float(lens_type.light) * sparse.vstack(rows, format="csr"))
 
 
-def _band(
-    camera: Camera, lens_type: LensType, wavelength: float | None, weight: float
-) -> tuple[sparse.csr_array, FloatArray]:
-    """Return H at one wavelength times the light of each pixel, and this light, whose share in all is `weight`."""
-    field = optics_of(camera, lens_type, wavelength)
-    check_waves(lens_type, field)
-    pixels = _pixels(camera, lens_type, field)
-    light = weight * field.weight(np.hypot(pixels.x, pixels.y))
-    return sparse.csr_array(sparse.diags_array(light) @ _rows(camera, field, pixels)), light
+def optics_by_band(camera: Camera, lens_type: LensType) -> Bands:
+    """Return a lens type at each wavelength of the light, and the share of this.
+
+    Raises InputError if the surfaces form no image, or aberrations of too many waves.
+    """
+    fields = tuple((optics_of(camera, lens_type, wavelength), weight) for wavelength, weight in bands(camera))
+    for field, _ in fields:
+        check_waves(lens_type, field)
+    return fields
 
 
-def _pixels(camera: Camera, lens_type: LensType, field: Optics) -> _PixelFootprints:
-    parts: list[FloatArray] = []
-    for sub in (sub for sub in camera.sub_imagers if sub.type == lens_type):
-        x, y, _ = pixel_middles(camera, sub, pose_of(sub)).reshape(-1, 3).T
-        down, across = edges_at(camera, field, lens_type, x, y)
-        rows = camera.rows / 2 - sub.lens[1] / camera.target_pitch + down
-        parts.append(np.stack([x, y, *rows.T, *(camera.columns / 2 - sub.lens[0] / camera.target_pitch + across).T]))
-    x, y, *edges = np.concatenate(parts, axis=1)
-    return _PixelFootprints(x, y, np.stack(edges[:2], axis=1), np.stack(edges[2:], axis=1), blur_of(camera, lens_type))
+def row_at(
+    camera: Camera,
+    lens_type: LensType,
+    fields: Bands,
+    place: tuple[float, float],
+    axis: FloatArray,
+    shape: tuple[int, int],
+    *,
+    interpolates: bool = False,
+) -> FloatArray:
+    """Return the row of H, (rows, columns) on a window of f, of the pixel at a place (x, y) from the lens's axis.
+
+    fields : of `optics_by_band`;  axis : (2,) row and column of the lens's axis on the window, whose shape is given
+    interpolates : between nodes of height, instead of tracing a wave
+    """
+    (x, y), pitch, blur = place, camera.target_pitch, blur_of(camera, lens_type)
+    height, angle = float(np.hypot(x, y)), float(np.arctan2(-x, y))
+    total, light = np.zeros(shape), 0.0
+    for field, weight in fields:
+        lit = weight * float(field.weight(np.array([height]))[0])
+        light += lit
+        if lit > 0:
+            edges = tuple(axis[:, None] + edges_at(camera, field, lens_type, np.array(x), np.array(y)))
+            if field.rays_suffice:
+                waves = field.between(height) if interpolates else [(field.rays(height, FINEST * pitch), 1.0)]
+                rows = [row_by_rays(wave.turned(angle), pitch, edges, blur, shape) * share for wave, share in waves]
+                row = sum(rows, np.zeros(shape))
+            else:
+                spread = _spread(field, *_folded(x, y), interpolates)
+                spread = (spread.T if abs(x) > abs(y) else spread)[:: -1 if y < 0 else 1, :: -1 if x < 0 else 1]
+                row = row_by_waves(spread, field.grid[0] / pitch, edges, blur, shape)
+            total += lit * row
+    return total / light if light > 0 else total
+
+
+def _folded(x: float, y: float) -> tuple[float, float]:
+    """Return the place in the half quadrant beside the y axis, of which (x, y) is a mirror image, to nine digits."""
+    near, far = sorted((abs(x), abs(y)))
+    return float(f"{near:.9g}"), float(f"{far:.9g}")
+
+
+@lru_cache(maxsize=16)
+def _spread(field: Optics, x: float, y: float, interpolates: bool) -> FloatArray:
+    """Return the point-spread function of a sensor point on the lens's grid, (n, n); see `row_at`."""
+    height, angle = float(np.hypot(x, y)), float(np.arctan2(-x, y))
+    waves = field.between(height) if interpolates else [(field.lit_wave(height), 1.0)]
+    spreads = [share * point_spread(wave.turned(angle), field.grid).values for wave, share in waves]
+    return np.asarray(np.sum(spreads, axis=0), dtype=np.float64)
 
 
 def edges_at(camera: Camera, field: Optics, lens_type: LensType, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -108,60 +143,6 @@ def blur_of(camera: Camera, lens_type: LensType) -> tuple[float, float]:
     """Return the standard deviation of the blur of a type's pixels over the sides of their open part."""
     deviation = (lens_type.optics.pixel_blur or 0.0) / camera.pixel_pitch
     return deviation / float(lens_type.open[0]), deviation / float(lens_type.open[1])
-
-
-def _rows(camera: Camera, field: Optics, pixels: _PixelFootprints) -> sparse.csr_array:
-    count = pixels.x.size
-    own = float(np.ptp(pixels.rows[0])) * (1 + 2 * DEVIATIONS * pixels.blur[0])
-    side = [min(size, own + 2 * field.reach / camera.target_pitch + 2) for size in camera.shape]
-    needed = int(count * side[0] * side[1]) * ENTRY
-    check_memory(needed, "H of blurred pixels", "crop the target or use fewer sub-imagers")
-    rows: list[sparse.csr_array] = [sparse.csr_array((1, camera.unknowns))] * count
-    lit = np.flatnonzero(field.weight(np.hypot(pixels.x, pixels.y)) > 0)
-    by_points = _by_rays if field.rays_suffice else _by_waves
-    for pixel, values in by_points(camera, field, pixels, lit):
-        values[values < LEAST] = 0.0
-        rows[pixel] = sparse.csr_array(values.reshape(1, -1))
-    return sparse.csr_array(sparse.vstack(rows, format="csr"))
-
-
-def _by_rays(
-    camera: Camera, field: Optics, pixels: _PixelFootprints, lit: IntArray
-) -> Iterator[tuple[int, FloatArray]]:
-    """Compute the entries, (rows, columns) of f, of each lit pixel from the rays of the nodes beside its height."""
-    for pixel in lit.tolist():
-        x, y = float(pixels.x[pixel]), float(pixels.y[pixel])
-        values, edges = np.zeros(camera.shape), (pixels.rows[pixel], pixels.columns[pixel])
-        for wave, share in field.between(float(np.hypot(x, y))):
-            turned = wave.turned(float(np.arctan2(-x, y)))
-            values += share * row_by_rays(turned, camera.target_pitch, edges, pixels.blur, camera.shape)
-        yield pixel, values
-
-
-def _by_waves(
-    camera: Camera, field: Optics, pixels: _PixelFootprints, lit: IntArray
-) -> Iterator[tuple[int, FloatArray]]:
-    """Compute the entries, (rows, columns) of f, of each lit pixel; pixels with one point-spread function in turn."""
-    cell, levels = field.grid[0] / camera.target_pitch, [max(steps, 1) for steps in field.steps]
-    keys = {int(pixel): _key(field, float(pixels.x[pixel]), float(pixels.y[pixel])) for pixel in lit}
-    spread_at, before = field.spreads(0.0), 0
-    for (turn, level), members in groupby(sorted(keys, key=keys.__getitem__), key=keys.__getitem__):
-        if turn != before:
-            spread_at, before = field.spreads(pi / 2 * turn / levels[1]), turn
-        spread = spread_at(field.field * level / levels[0])
-        for pixel in members:
-            x, y = pixels.x[pixel], pixels.y[pixel]
-            turned = spread.T if abs(x) > abs(y) else spread
-            turned = turned[:: -1 if y < 0 else 1, :: -1 if x < 0 else 1]
-            edges = pixels.rows[pixel], pixels.columns[pixel]
-            yield pixel, row_by_waves(turned, cell, edges, pixels.blur, camera.shape)
-
-
-def _key(field: Optics, x: float, y: float) -> tuple[int, int]:
-    """Return the level of direction, folded into the half quadrant beside the y axis, and of height, of a pixel."""
-    levels, turns = field.steps
-    angle = float(np.arctan2(min(abs(x), abs(y)), max(abs(x), abs(y))))
-    return round(angle / (pi / 2) * turns), round(float(np.hypot(x, y)) / field.field * levels)
 
 
 def overlaps(edges: FloatArray, offsets: FloatArray, size: int, cell: float) -> FloatArray:

@@ -230,13 +230,13 @@ class Camera:
         """Row and column of the middle of each measurement's footprint: (M,) each."""
         places: list[FloatArray] = []
         for lens_type in self.on_grids.types:
-            ratio, order = float(lens_type.ratio), (*lens_type.array, *lens_type.pixels)
+            ratio = float(lens_type.ratio)
             axes = [
                 np.add.outer([float(start) for start in lens_type.starts(axis)], ratio * (np.arange(pixels) + 0.5))
                 for axis, pixels in enumerate(lens_type.pixels)
             ]
-            down = np.broadcast_to(axes[0][:, None, :, None], order)
-            places.append(np.stack([down.ravel(), np.broadcast_to(axes[1][None, :, None, :], order).ravel()]))
+            grid = np.meshgrid(*(axis.ravel() for axis in axes), indexing="ij")
+            places.append(np.stack([lens_type.in_order(line) for line in grid]))
         row, column = np.concatenate(places, axis=1)
         return row, column
 

@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
 
 from .tables.camera import Surface
@@ -158,7 +157,7 @@ class LensType:
         (down, across), (rows, columns) = self.array, self.pixels
         return lines.reshape(down, rows, across, columns).swapaxes(1, 2).ravel()
 
-    def by_lines(self, readings: FloatArray) -> FloatArray:
+    def by_lines(self, readings: NDArray[Number]) -> NDArray[Number]:
         """Return readings, in the order of measurements, as (sensor rows, sensor columns)."""
         (down, across), (rows, columns) = self.array, self.pixels
         return readings.reshape(down, across, rows, columns).swapaxes(1, 2).reshape(down * rows, across * columns)

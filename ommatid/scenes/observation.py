@@ -149,9 +149,9 @@ class ObservationPart(ABC):
     def measurements_inside(self, rows: slice, columns: slice) -> IntArray:
         """Return the indices of the measurements that see a window of f and nothing beside it."""
 
-    @abstractmethod
     def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to the measurements inside it."""
+        return self.rows_on(self.measurements_inside(rows, columns), rows, columns)
 
     def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to some measurements; what they see beside it is left out."""
@@ -161,9 +161,9 @@ class ObservationPart(ABC):
         order = np.argsort(inside)
         return self.submatrix(rows, columns)[order[np.searchsorted(inside, numbers, sorter=order)]]
 
-    @abstractmethod
     def signature(self, rows: slice, columns: slice) -> Hashable:
-        """Return a key that is equal for two windows only if their submatrices are equal."""
+        """Return a key that is equal for two windows only if their submatrices are equal: by default the window."""
+        return rows.start, columns.start
 
 
 @dataclass(frozen=True)
@@ -229,17 +229,9 @@ class Entries(ObservationPart):
         inside = (top >= rows.start) & (bottom < rows.stop) & (left >= columns.start) & (right < columns.stop)
         return np.flatnonzero(inside)
 
-    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
-        """Return H from a window of f to the measurements inside it."""
-        return on_window(self.matrix[self.measurements_inside(rows, columns)], self.grid[1], rows, columns)
-
     def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to some measurements; what they see beside it is left out."""
         return on_window(self.matrix[numbers], self.grid[1], rows, columns)
-
-    def signature(self, rows: slice, columns: slice) -> Hashable:
-        """Return a key of the window alone: entries are never the same elsewhere."""
-        return rows.start, columns.start
 
 
 @dataclass(frozen=True)

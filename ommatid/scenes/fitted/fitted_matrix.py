@@ -21,7 +21,7 @@ from ommatid.runtime.machine import processors
 
 from ..camera import Camera
 from ..lens_type import LensType, SubImager
-from ..observation import Observation, ObservationPart, Seen
+from ..observation import Entries, Observation, ObservationPart, Seen
 from ..tables.table import LARGEST
 from .kernel_shapes import Numbers
 from .kernels import KernelFootprints
@@ -152,18 +152,28 @@ class FittedMatrix:
         return not self.kernels and all(self.views[lens.name].is_as_designed for lens in self.camera.types)
 
     @cached_property
-    def observation(self) -> Observation | None:
-        """H by boxes and kernels, None where it has entries: sub-imagers measured, rotated or distorted."""
+    def _whole(self) -> Observation:
+        """H by boxes, kernels and entries; rows of sub-imagers that are not explained are empty."""
         parts: list[ObservationPart] = []
         for lens, views, subs, _ in self._types:
+            pairs = list(zip(subs, views.numbers, strict=True))
             if lens.name in self.kernels:
                 parts.append(self.kernels[lens.name])
-                continue
-            straight = views.explained.all() and not views.numbers[:, [ROTATION, K1]].any()
-            if not (straight and self.camera.has_boxes(lens)):
-                return None
-            parts += boxes_of(self.camera, lens, list(zip(subs, views.numbers, strict=True)))
+            elif views.explained.all() and not views.numbers[:, [ROTATION, K1]].any() and self.camera.has_boxes(lens):
+                parts += boxes_of(self.camera, lens, pairs)
+            else:
+                empty = Entries(
+                    sparse.csr_array((lens.measurements // lens.count, self.camera.unknowns)), self.camera.shape
+                )
+                known = zip(pairs, views.explained, strict=True)
+                parts += [part_of(self.camera, *pair) if explained else empty for pair, explained in known]
         return Observation(self.camera.shape, tuple(parts))
+
+    @property
+    def observation(self) -> Observation | None:
+        """H by boxes and kernels, None where it has entries: sub-imagers measured, rotated or distorted."""
+        boxes = all(lens.name in self.kernels or self.camera.has_boxes(lens) for lens in self.camera.types)
+        return self._whole if boxes and not any(isinstance(part, Entries) for part in self._whole.parts) else None
 
     @cached_property
     def is_nearly_designed(self) -> bool:
@@ -191,22 +201,9 @@ class FittedMatrix:
 
     def to_sparse(self) -> sparse.csr_array:
         """Return H, (M, N); rows of sub-imagers that are not explained are empty."""
-        parts: list[sparse.csr_array] = []
-        for lens, views, subs, _ in self._types:
-            if lens.name in self.kernels:
-                parts.append(self.kernels[lens.name].to_sparse())
-                continue
-            for sub, numbers, explained in zip(subs, views.numbers, views.explained, strict=True):
-                parts.append(self._rows(sub, numbers) if explained else self._no_rows(sub))
-        return sparse.csr_array(sparse.vstack(parts, format="csr"))
-
-    def _rows(self, sub: SubImager, numbers: FloatArray) -> sparse.csr_array:
-        rows = part_of(self.camera, sub, numbers).to_sparse()
+        rows = self._whole.to_sparse()
         rows.eliminate_zeros()
         return rows
-
-    def _no_rows(self, sub: SubImager) -> sparse.csr_array:
-        return sparse.csr_array((sub.type.pixels[0] * sub.type.pixels[1], self.camera.unknowns))
 
     def restrict(self, camera: Camera) -> FittedMatrix:
         """Return H of a camera with some of the lens types."""

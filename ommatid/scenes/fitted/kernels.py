@@ -12,7 +12,7 @@ are applied by Fourier transforms.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import gcd
@@ -423,21 +423,12 @@ class KernelFootprints(ObservationPart):
             (np.maximum(start, 0) >= part.start) & (np.minimum(start + self.places.width, size) <= part.stop)
             for start, part, size in zip(self.places.starts, (rows, columns), self.shape, strict=True)
         ]
-        order = (*self.places.lens_type.array, *self.places.lens_type.pixels)
-        every = np.arange(self.measurements).reshape(order).swapaxes(1, 2).reshape(inside[0].size, inside[1].size)
+        every = self.places.lens_type.by_lines(np.arange(self.measurements))
         return np.sort(every[np.ix_(*inside)].ravel())
-
-    def submatrix(self, rows: slice, columns: slice) -> sparse.csr_array:
-        """Return H from a window of f to the measurements inside it."""
-        return self.rows(self.measurements_inside(rows, columns), (rows, columns))
 
     def rows_on(self, numbers: IntArray, rows: slice, columns: slice) -> sparse.csr_array:
         """Return H from a window of f to some measurements; what they see beside it is left out."""
         return self.rows(numbers, (rows, columns))
-
-    def signature(self, rows: slice, columns: slice) -> Hashable:
-        """Return a key of the window alone: kernels vary over the field."""
-        return rows.start, columns.start
 
     @cached_property
     def mean_kernel(self) -> FloatArray:

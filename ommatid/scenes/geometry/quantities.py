@@ -6,8 +6,6 @@ are not standardised: sensors of one name differ by some percent, so the size of
 
 from __future__ import annotations
 
-import difflib
-from fractions import Fraction
 from math import pi
 from typing import Annotated
 
@@ -61,22 +59,8 @@ def _size(value: object) -> object:
         return named[name]
     raise ValueError(
         f"expected one of the formats {', '.join(FORMATS)}, or height and width, such as"
-        f' ["4.55 mm", "6.17 mm"], got {shortened_repr(value)[:50]}; the nearest format is "{_nearest(name)}"'
+        f' ["4.55 mm", "6.17 mm"], got {shortened_repr(value)[:50]}; take one of these'
     )
-
-
-def _nearest(name: str) -> str:
-    """The format of the nearest diameter, or else the nearest name."""
-    try:
-        inches = _inches(name)
-    except (ValueError, ZeroDivisionError):
-        return max(FORMATS, key=lambda known: difflib.SequenceMatcher(None, name, known.casefold()).ratio())
-    return min(list(FORMATS)[:-2], key=lambda known: abs(_inches(known) - inches))
-
-
-def _inches(name: str) -> Fraction:
-    numerator, _, denominator = name.partition("/")
-    return Fraction(numerator) / Fraction(denominator or 1)
 
 
 FNumber = Annotated[float, Field(gt=0, le=1e6)]

@@ -13,7 +13,6 @@ import csv
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from math import expm1, log1p
 from pathlib import Path
 from time import perf_counter
@@ -30,9 +29,8 @@ from ommatid.runtime.versions import versions
 
 from ..camera import Camera
 from ..constants import WHITE
-from ..lens_type import LensType
 from ..model import RECORDED, Model
-from ..optics.boxes import Box, designed_box
+from ..optics.boxes import designed_box
 from ..scene import Scene
 from ..setup import Setup
 from .frames import AcquisitionSettings, RecordedFrames, read_frames
@@ -41,78 +39,30 @@ ROUNDS = 20  # of weights, at most, in a fit of noise
 TIE = 1e-9  # pixels of f, below which a distance to the edge of a footprint counts as 0
 
 
-@dataclass(frozen=True)
-class FootprintAssignment:
-    """Footprints of all sensor pixels, widened by a `margin` in pixels of f."""
+def nearest_sources(camera: Camera, positions: Sequence[IntArray], files: Sequence[Path]) -> IntArray:
+    """Return the pixel of f of the source that each reading is assigned to, (exposures, M), -1 beyond all footprints.
 
-    camera: Camera
-    margin: float
-
-    @cached_property
-    def _parts(self) -> list[tuple[slice, Box, list[FloatArray]]]:
-        """Measurements of each lens type, its footprints, and their middles along both axes, (S,) each."""
-        types = self.camera.on_grids.types
-        boxes = [designed_box(self.camera.shape, lens_type) for lens_type in types]
-        middles = [[_middles(lens_type, axis) for axis in (0, 1)] for lens_type in types]
-        return list(zip(self.camera.on_grids.type_slices(), boxes, middles, strict=True))
-
-    @property
-    def middles(self) -> FloatArray:
-        """Rows and columns of the middles of all footprints, in pixels of f: (M, 2)."""
-        found = np.empty((self.camera.measurements, 2))
-        for measurements, box, (down, across) in self._parts:
-            pixels = measurements.start + box.numbers(np.arange(down.size), np.arange(across.size))
-            found[pixels] = np.stack(np.meshgrid(down, across, indexing="ij"), axis=-1).reshape(-1, 2)
-        return found
-
-    def reached(self, row: int, column: int) -> tuple[IntArray, FloatArray]:
-        """Sensor pixels that a source may reach, and the distances of their footprints: (n,) each.
-
-        The distance is the larger one along rows and columns from the edge of the footprint, in pixels of f.
-        """
-        pixels: list[IntArray] = []
-        distances: list[FloatArray] = []
-        for measurements, box, middles in self._parts:
-            down, across = (
-                np.abs(of - (at + 0.5)) - float(side) / 2
-                for of, at, side in zip(middles, (row, column), box.lens_type.footprint, strict=True)
+    positions : (sources, 2) rows and columns of f, of each exposure
+    The distance of a source from a footprint is the larger one along rows and columns from its edge, in pixels of f.
+    Raises InputError if two sources of an exposure lie in the footprint of one sensor pixel.
+    """
+    sides = [np.repeat([[float(side) / 2] for side in lens.footprint], lens.measurements, 1) for lens in camera.types]
+    halves, middles = np.concatenate(sides, axis=1), np.stack(camera.middles)
+    nearest = np.full((len(files), camera.measurements), -1, dtype=np.int64)
+    for found, where, file in zip(nearest, positions, files, strict=True):
+        far = np.array([(np.abs(middles - (at[:, None] + 0.5)) - halves).max(axis=0) for at in where])  # (sources, M)
+        both_inside = np.flatnonzero((far < 0.5 - TIE).sum(axis=0) > 1)
+        if both_inside.size:
+            nearer, farther = (
+                tuple(at.tolist()) for at in where[np.argsort(far[:, both_inside[0]], kind="stable")[:2]]
             )
-            rows, columns = (np.flatnonzero(of < self.margin + 0.5 - TIE) for of in (down, across))
-            pixels.append(measurements.start + box.numbers(rows, columns))
-            distances.append(np.maximum(down[rows][:, None], across[columns]).ravel())
-        return np.concatenate(pixels), np.concatenate(distances)
-
-    def nearest_sources(self, positions: IntArray, file: Path) -> tuple[IntArray, IntArray]:
-        """Sensor pixels that any source of one exposure may reach, and the pixel of f of the nearest: (n,) each.
-
-        positions : (sources, 2) rows and columns of f
-        Raises InputError if two sources lie in the footprint of one sensor pixel.
-        """
-        reached = [self.reached(row, column) for row, column in positions.tolist()]
-        pixel = np.concatenate([pixels for pixels, _ in reached])
-        distance = np.concatenate([distances for _, distances in reached])
-        source = np.repeat(np.arange(len(reached)), [pixels.size for pixels, _ in reached])
-        order = np.lexsort((distance, pixel))
-        pixel, distance, source = pixel[order], distance[order], source[order]
-        repeated = pixel[1:] == pixel[:-1]
-        both_inside = repeated & (distance[1:] < 0.5 - TIE)  # the source before is nearer, so it is inside too
-        if both_inside.any():
-            first = int(np.flatnonzero(both_inside)[0])
-            nearer, farther = (tuple(positions[source[first + step]].tolist()) for step in (0, 1))
             raise InputError(
                 f"{file}: the points at {nearer} and {farther}, row and column of f, lie in the footprint of one sensor"
                 " pixel; record them in two images"
             )
-        nearest = np.concatenate([[True], ~repeated])
-        unknown = positions[:, 0] * self.camera.columns + positions[:, 1]
-        return pixel[nearest], unknown[source[nearest]]
-
-
-def _middles(lens_type: LensType, axis: int) -> FloatArray:
-    """Middles of a lens type's footprints along rows (axis 0) or columns (1) of f, (S,)."""
-    starts = np.array([float(start) for start in lens_type.starts(axis)])
-    middles = starts[:, None] + float(lens_type.ratio) * (np.arange(lens_type.pixels[axis]) + 0.5)
-    return np.asarray(middles.ravel(), dtype=np.float64)
+        reached = far.min(axis=0) < MARGIN + 0.5 - TIE
+        found[reached] = (where @ (camera.columns, 1))[far.argmin(axis=0)[reached]]
+    return nearest
 
 
 def unrecorded(camera: Camera, positions: IntArray) -> IntArray:
@@ -289,7 +239,7 @@ def from_recorded_points(
         positions_by_rows(camera, frames.files) if places is None else read_positions(places, camera, frames.files)
     )
     readings = _readings(scene, frames, value)
-    nearest = _nearest_sources(camera, positions, frames.files)
+    nearest = nearest_sources(camera, positions, frames.files)
     lone = np.array([int(where[0] @ (camera.columns, 1)) if len(where) == 1 else -1 for where in positions])
     unlit = background(camera, readings, nearest >= 0, lone, frames.darks or np.inf)
     entries = _entries(np.where(unlit.far, lone[:, None], nearest), readings - unlit.level, camera.unknowns)
@@ -365,16 +315,6 @@ def _readings(scene: Scene, frames: RecordedFrames, value: float) -> FloatArray:
         readings[frames.numbers >= scene.sensor.full] = np.nan
     readings[~np.isfinite(readings)] = np.nan
     return readings
-
-
-def _nearest_sources(camera: Camera, positions: list[IntArray], files: list[Path]) -> IntArray:
-    """Pixel of f of the source that each reading is assigned to, (exposures, M), -1 beyond all footprints."""
-    footprints = FootprintAssignment(camera, MARGIN)
-    nearest = np.full((len(files), camera.measurements), -1, dtype=np.int64)
-    for of_exposure, where, file in zip(nearest, positions, files, strict=True):
-        pixel, unknown = footprints.nearest_sources(where, file)
-        of_exposure[pixel] = unknown
-    return nearest
 
 
 def background(camera: Camera, readings: FloatArray, near: BoolArray, lone: IntArray, darks: float) -> Background:
@@ -500,7 +440,7 @@ def _check_order(camera: Camera, entries: RecordedEntries, seen: BoolArray) -> N
     its light. Its slopes tell how the points were scanned.
     """
     unknown, light = entries.unknown[seen], entries.mean[seen]
-    middles = FootprintAssignment(camera, MARGIN).middles[entries.pixel[seen]]
+    middles = np.stack(camera.middles, axis=1)[entries.pixel[seen]]
     lit, point = np.unique(unknown, return_inverse=True)
     weight = np.sqrt(np.bincount(point, light))
     centres = np.stack([np.bincount(point, light * middle) for middle in middles.T], axis=1) / weight[:, None]

@@ -199,22 +199,18 @@ def light_kept_in_focus(side: float) -> float:
     return float(side**2 * np.pi / 2 * (weights[:, None] * weights * q * transfer * square).sum())
 
 
-def change_by_diffraction(camera: Camera, lens_type: LensType, aperture: float, focus: float) -> float:
-    """Bound on the change of a measurement of values from 0 to 255 by 550 nm diffraction at an aperture.
+def change_by_diffraction(camera: Camera, lens_type: LensType) -> float:
+    """Bound on the change of a measurement of values from 0 to 255 by 550 nm diffraction at a type's aperture.
 
-    The light that leaves a sensor pixel's footprint with diffraction, and without it by defocus. Both lengths in mm.
+    The light that leaves a sensor pixel's footprint with diffraction, and without it by defocus.
     """
-    from .field import MOST_RINGS
+    from .field import MOST_RINGS, optics_of
     from .lens_matrix import row_by_rays, row_by_waves
     from .point_spread import point_spread
-    from .wavefront import thin_wavefront
 
-    distance, footprint = camera.distance_of(lens_type), float(lens_type.ratio) * camera.target_pitch
+    lens, footprint = optics_of(camera, lens_type, GREEN), float(lens_type.ratio) * camera.target_pitch
+    rays, wave = lens.outline(0.0), lens.lit_wave(0.0)
     edges, shape, sharp = (np.array([0.0, 1.0]),) * 2, (1, 1), (0.0, 0.0)
-    rays, wave = (
-        thin_wavefront(aperture, camera.depth(lens_type), 0.0, distance, focus, wavelength)
-        for wavelength in (None, GREEN)
-    )
     kept = [row_by_rays(rays, footprint, edges, sharp, shape)] * 2
     if rays.spot_radius < MOST_RINGS * wave.resolution:
         spread = point_spread(wave)
@@ -299,9 +295,7 @@ def _without_waves(camera: Camera) -> SkippedEffect:
     """The diffraction that rays lack. Its bound is that of thin lenses; lenses with surfaces have none here."""
     why = "camera.wavelength is 'none': light is rays"
     bounds = [
-        change_by_diffraction(camera, lens_type, lens_type.optics.aperture, camera.focus(lens_type))
-        for lens_type in camera.types
-        if lens_type.optics.aperture is not None
+        change_by_diffraction(camera, lens_type) for lens_type in camera.types if lens_type.optics.aperture is not None
     ]
     if any(lens_type.optics.surfaces is not None for lens_type in camera.types):
         why += ", also behind surfaces, where diffraction has no bound"

@@ -140,24 +140,22 @@ def stage(scene: Scene, variant: str, target: dict[str, Any] | None) -> StagedWo
     check_positions(built, where)
     if not built.emitters():
         raise InputError(f"{where} has no emitter, so the image is black; add one, such as <emitter type='constant'/>")
+    direct_only, integrator = False, built.integrator()
     if not parsed.has_integrator:
         direct_only = not (scene.render.complete or has_interreflections(built))
         path = {"type": "path", "max_depth": 1 if direct_only else DEEPEST, "block_size": BLOCK}
-        return StagedWorld(
-            built, mi.load_dict(path), placement, len(parsed.sensors), direct_only, where, target is not None
-        )
-    if not isinstance(built.integrator(), mi.SamplingIntegrator):
+        integrator = mi.load_dict(path)
+    if not isinstance(integrator, mi.SamplingIntegrator):
         raise InputError(f"{where}: its integrator does not follow rays from a camera; expected one such as 'path'")
-    more = built.integrator().aov_names()
+    more = integrator.aov_names()
     if more:
         words = printable(", ".join(more), 60)
         raise InputError(
             f"{where}: its integrator returns {len(more)} more channels ({words}); expected the radiance alone, as of"
             " 'path': remove 'aov' and 'moment'"
         )
-    return StagedWorld(
-        built, built.integrator(), placement, len(parsed.sensors), where=where, signed=target is not None
-    )
+    signed = target is not None
+    return StagedWorld(built, integrator, placement, len(parsed.sensors), direct_only, where, signed)
 
 
 def _placement(scene: Scene, sensors: list[Any], where: str) -> Placement:

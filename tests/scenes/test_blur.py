@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import integrate, special
+from scipy import special
 
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.constants import GREEN
 from ommatid.scenes.lens_type import LensOptics
-from ommatid.scenes.optics.diffraction import TAIL, Pattern, pattern
+from ommatid.scenes.optics.diffraction import TAIL, pattern
 from ommatid.scenes.optics.field import FINEST
 from ommatid.scenes.optics.lens_kernels import blurred_matrix, kernels
 from ommatid.scenes.optics.lens_matrix import matrix, row_by_rays, row_by_waves
@@ -217,39 +217,10 @@ def test_pixels_off_the_axis_follow_the_cos4_law(focus: float) -> None:
 # --- diffraction of a defocused circular pupil
 
 
-WAVES = [0.0, 0.1, 0.21, 0.5, 1.0, 2.0, 3.0, 20.0]
-FREQUENCIES = [0.1, 0.3, 0.5, 0.7, 0.9]  # of the cut-off
-
-
-def hopkins(q: float, waves: float) -> float:
-    """Transfer function of a defocused circular pupil (H. H. Hopkins, Proc. R. Soc. A 231, 91 (1955), Eq. 16)."""
-    chord, _ = integrate.quad(  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-        lambda x: np.cos(8 * np.pi * waves * q * x) * np.sqrt(1 - (x + q) ** 2), 0, 1 - q, limit=500
-    )
-    return float(4 / np.pi * chord)
-
-
-def modulation(psf: Pattern, q: float) -> float:
-    v = np.linspace(0.0, psf.end, 20001)
-    return float(integrate.simpson(psf.spread(v) * special.j0(2 * q * v), x=v))
-
-
-@pytest.mark.parametrize("waves", [0.0, 0.085, 0.21, 0.33, 0.5, 0.9, 1.0, 2.0])
-def test_the_strehl_ratio_of_defocus_is_its_squared_sinc(waves: float) -> None:
-    v = np.array([1e-4])
-    assert 2 * pattern(waves).spread(v)[0] / v[0] == pytest.approx(np.sinc(waves) ** 2, abs=1e-8)
-
-
 def test_the_strehl_ratio_of_the_documentation() -> None:
     v = np.array([1e-4])
     strehl = 2 * pattern(0.21).spread(v)[0] / v[0]
     check_figures("diffraction.md", "with 0.21 waves of defocus, the Strehl ratio is {};", strehl)
-
-
-@pytest.mark.parametrize("waves", WAVES)
-def test_modulation_at_five_frequencies_is_hopkins(waves: float) -> None:
-    for q in FREQUENCIES:
-        assert modulation(pattern(waves), q) == pytest.approx(hopkins(q, waves), abs=1e-3)
 
 
 def test_the_pattern_in_focus_is_airy_s() -> None:
@@ -260,38 +231,25 @@ def test_the_pattern_in_focus_is_airy_s() -> None:
     assert psf.encircled == pytest.approx(1 - TAIL, abs=3e-5)
 
 
-@pytest.mark.parametrize("waves", WAVES)
-def test_encircled_energy_follows_from_the_transfer_function(waves: float) -> None:
-    """The share within v is 2 v times the integral of the transfer function and J1(2 q v) over q (Parseval)."""
-    psf = pattern(waves)
-    x, w = np.polynomial.legendre.leggauss(400)
-    q = np.sin(np.pi / 4 * (1 + x)) ** 2
-    weights = np.pi / 4 * w * np.sin(np.pi / 2 * (1 + x))
-    otf = np.array([hopkins(value, waves) for value in q])
-    for share in (0.05, 0.2, 0.5, 0.8):
-        v = share * psf.end
-        expected = 2 * v * weights @ (otf * special.j1(2 * q * v))
-        assert psf.within(v) == pytest.approx(expected, abs=1e-3)
-
-
-@pytest.mark.parametrize("waves", [0.0, 0.05, 0.3, 2.0])
+@pytest.mark.parametrize("waves", [0.0, 0.05, 0.3, 2.0, 20.0])
 @pytest.mark.parametrize("weight", [0.0, 0.03])
-def test_a_pupil_with_a_bright_side(waves: float, weight: float) -> None:
-    """Against the field of 300 x 96 points of a pupil whose amplitude is larger on one side, squared."""
+def test_the_pattern_is_the_squared_field_of_a_pupil_with_a_bright_side(waves: float, weight: float) -> None:
+    """Against the field of 300 x 512 points of a pupil whose amplitude is larger on one side, squared."""
     psf, s = pattern(waves, weight), 1e-4
+    assert 1 - 1.5 * TAIL < psf.encircled < 1 - 0.5 * TAIL
     nodes, shares = np.polynomial.legendre.leggauss(300)
-    u, turn = (1 + nodes[:, None]) / 2, 2 * np.pi * np.arange(96) / 96
-    element = shares[:, None] / 2 * u * 2 * np.pi / 96 * np.exp(2j * np.pi * waves * u**2) / (1 + weight * u**2)
+    u, turn = (1 + nodes[:, None]) / 2, 2 * np.pi * np.arange(512) / 512
+    element = shares[:, None] / 2 * u * 2 * np.pi / 512 * np.exp(2j * np.pi * waves * u**2) / (1 + weight * u**2)
 
     def light(v: float, angle: float, side: float) -> float:
         tilted = element * (1 + side * u * np.cos(turn) / (1 + weight * u**2))
         # A point of a pupil that is defocused outwards sends its ray outwards.
         return float(np.abs((tilted * np.exp(-1j * v * u * np.cos(turn - angle))).sum()) ** 2)
 
-    for v in (0.7, 2.5, 6.0):
+    for v in (1e-4, 0.7, 2.5, 6.0, 0.3 * psf.end, 0.9 * psf.end):
         middle = light(v, 0.4, 0.0)
         whole = 2 * np.pi**2 * 2 / (2 * (1 + weight))  # by Parseval, of v dv
-        assert psf.spread(np.array([v]))[0] == pytest.approx(v * middle / whole, rel=1e-6)
+        assert psf.spread(np.array([v]))[0] == pytest.approx(v * middle / whole, rel=1e-6, abs=1e-7)
         change = (light(v, 0.4, s) - light(v, 0.4, -s)) / (2 * s)
         assert psf.slant(np.array([v]))[0] * np.cos(0.4) == pytest.approx(v * change / whole, abs=1e-6)
 

@@ -23,7 +23,6 @@ from ommatid.scenes.setup import Setup
 from ommatid.simulate.adaptive_render import (
     FLOAT32,
     LEAST,
-    MOST,
     SAMPLES,
     SHARE,
     TIME,
@@ -37,14 +36,13 @@ from ommatid.simulate.sampling.passes import (
     Plan,
     Rendering,
     SampleLaw,
-    cells_of,
-    on_grid,
     rounding_variance,
     samples_within,
 )
 
 from ..conftest import Command
 from ..examples import GALLERY, SLOW_SCALAR, THREE, VARIANTS, needs, scene
+from .test_checkpoint import after
 
 FRACTIONAL = (("2/5", [2, 2], [5, 5]), ("3/8", [2, 2], [4, 4]))  # pixels see pixels of f in part
 
@@ -116,24 +114,6 @@ def test_values_do_not_depend_on_other_sub_imagers(variant: str) -> None:
     assert first.variance[:count].tobytes() == other.variance.tobytes()
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_values_do_not_depend_on_the_number_of_threads(variant: str) -> None:
-    needs(variant)
-    import drjit as dr
-
-    described = auto(variant=variant, lenses=FRACTIONAL)
-    before, found = dr.thread_count(), list[Rendering]()
-    try:
-        for threads in (1, 5):
-            dr.set_thread_count(threads)
-            found.append(lit(described))
-    finally:
-        dr.set_thread_count(before)
-    assert found[0].mean.tobytes() == found[1].mean.tobytes()
-    assert found[0].variance.tobytes() == found[1].variance.tobytes()
-    assert found[0].record == found[1].record
-
-
 def test_the_time_limit_ends_rendering_after_the_first_round() -> None:
     ticks = iter(range(10**6))
     described = auto(sampler="independent", time="3 s")
@@ -200,12 +180,8 @@ def test_an_interrupted_rendering_continues(tmp_path: Path) -> None:
     described = auto(lenses=FRACTIONAL)
     camera, image = derive(described), load(described)
 
-    def interrupt(done: float) -> None:
-        if done >= 0.5:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        cached_stack(tmp_path / "stack.exr", Setup(described, camera, image), interrupt)
+        cached_stack(tmp_path / "stack.exr", Setup(described, camera, image), after(0.5))
     assert [path.name for path in tmp_path.iterdir()] == [".stack.exr.partial.npz"]
     found, _ = cached_stack(tmp_path / "stack.exr", Setup(described, camera, image), no_progress)
     whole, _ = cached_stack(tmp_path / "whole.exr", Setup(described, camera, image), no_progress)
@@ -227,17 +203,8 @@ def test_predicted_samples_divide_the_variance_by_the_factor() -> None:
         assert law.ratio(last, Plan(32, 256)) == pytest.approx(1 / (2 * 4**exponent), rel=1e-12)
 
 
-def test_grids_fit_and_rounding_inverts() -> None:
-    for cells in (1, 2, 3, 5, 7, 16):
-        for samples in (16, 256, 1000, 40000, MOST):
-            work = on_grid(samples, "multijitter", cells)
-            side = round(work.samples**0.5)
-            assert side**2 == work.samples
-            assert side % cells == 0
-            assert work.total >= samples
-            assert work.samples <= 4096
+def test_the_rounding_variance_inverts() -> None:
     values = np.array([3.0, 255.0])
-    assert cells_of(derive(auto()).types[0]) == 3
     for samples in (64, 1024, 4096):
         variance = rounding_variance(values, samples)
         assert samples - 1 <= samples_within(values, variance) <= samples, "rounded down"

@@ -15,7 +15,7 @@ from scipy import stats
 
 from ommatid.reconstruct.methods.method import total_variance
 from ommatid.reconstruct.noise import known_noise, usable_pixels
-from ommatid.reconstruct.restore import Reconstruction, restore
+from ommatid.reconstruct.restore import restore
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.streams import Purpose
 from ommatid.scenes.camera import Camera, derive
@@ -29,7 +29,7 @@ from ommatid.simulate import sensors
 from ommatid.simulate.ideal import ideal_model
 from ommatid.simulate.sensors import expose, generators, quantise, record
 
-from ..examples import THREE, Lenses, camera, familywise, scene
+from ..examples import THREE, Lenses, camera, familywise, inside_interval, not_none, scene
 
 Vector = NDArray[np.float64]
 
@@ -246,12 +246,6 @@ def taken(lux: float, seed: int = 0, lenses: Lenses = THREE, response: float = 1
     return Stack(described, camera, found.values, np.zeros(camera.measurements), told, found), model
 
 
-def inside(found: Reconstruction) -> bool:
-    assert found.interval is not None
-    assert found.error is not None
-    return found.interval.low < found.error.mse < found.interval.high
-
-
 @pytest.mark.slow
 def test_the_second_estimate_of_the_noise_is_more_accurate_and_as_good_a_weight() -> None:
     """Few electrons, where a reading alone says little of the noise it has; against that, and against the truth."""
@@ -266,15 +260,11 @@ def test_the_second_estimate_of_the_noise_is_more_accurate_and_as_good_a_weight(
         assert _distance(second, noises[1]) < _distance(first, noises[1]) < _distance(*noises)
         ideal = stack.scene.model_copy(update={"sensor": None})
         told = [replace(stack, scene=ideal, recording=None, rendering_variance=noise) for noise in noises]
-        errors.append([_mse(one) for one in (restore(told[0], model, truth), found, restore(told[1], model, truth))])
+        every = restore(told[0], model, truth), found, restore(told[1], model, truth)
+        errors.append([not_none(one.error).mse for one in every])
     by_reading, by_second, by_truth = np.mean(errors, axis=0)
     assert by_second < 0.9 * by_reading
     assert by_second < 1.02 * by_truth
-
-
-def _mse(found: Reconstruction) -> float:
-    assert found.error is not None
-    return found.error.mse
 
 
 def _distance(one: Vector, other: Vector) -> float:
@@ -292,9 +282,7 @@ def test_saturated_and_dead_pixels_are_left_out() -> None:
     assert 20 < usable.saturated < 500
     found = restore(stack, model, load(stack.scene).ravel())
     assert np.isfinite(found.estimate).all()
-    assert found.error is not None
-    assert found.interval is not None
-    assert found.error.mse < found.interval.high
+    assert not_none(found.error).mse < not_none(found.interval).high
 
 
 def test_assumed_noise_variance_with_a_sensor() -> None:
@@ -305,7 +293,7 @@ def test_assumed_noise_variance_with_a_sensor() -> None:
     told = stack.scene.estimator.model_copy(update={"noise_variance": 1.0})
     truth = load(stack.scene).ravel()
     flat = restore(replace(stack, scene=stack.scene.model_copy(update={"estimator": told})), model, truth)
-    assert inside(flat)
+    assert inside_interval(flat)
     assert flat.expected.mse >= restore(stack, model).expected.mse
 
 

@@ -16,7 +16,7 @@ from ommatid.simulate.ideal import ideal_matrix, true_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import choose
 from ommatid.simulate.sampling import passes
-from ommatid.simulate.sampling.passes import AVERAGED, Plan, exact_plan, rounding_variance
+from ommatid.simulate.sampling.passes import AVERAGED, Plan, cells_of, exact_plan, rounding_variance
 
 from ..examples import VARIANTS, needs, scene, with_optics
 
@@ -86,6 +86,7 @@ def test_pinholes_are_exact_by_grids_or_by_averages() -> None:
 
     exact = Setup.from_scene(auto())
     assert plans(exact) == {Plan(2, 25), Plan(2, 64)}
+    assert [cells_of(lens_type) for lens_type in exact.camera.types] == [5, 8]
     assert plans(exact, "independent") == {None}
     averages = AVERAGED
     for lens, table, expected in (

@@ -23,8 +23,8 @@ from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.ideal import ideal_matrix
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate
-from ommatid.simulate.sampling.passes import BATCHES, Tally, plan, rounding_variance
-from ommatid.simulate.sampling.samplers import filling, fitting
+from ommatid.simulate.sampling.passes import BATCHES, JITTERED, Tally, on_grid, plan, rounding_variance
+from ommatid.simulate.sampling.samplers import SOBOL, filling, fitting
 
 from ..examples import SLOW_SCALAR, THREE, VARIANTS, camera, familywise, needs, scene
 from .strata import corners
@@ -46,13 +46,28 @@ def test_mitsuba_accepts_the_numbers_of_samples_unchanged(variant: str) -> None:
             assert mitsuba.sample_count() == count >= asked
 
 
-@given(st.sampled_from(SAMPLERS), st.integers(1, 20_000))
-def test_numbers_of_samples_fill_the_grid_and_are_the_least(sampler: Sampler, samples: int) -> None:
+@given(st.sampled_from((*SAMPLERS, SOBOL)), st.integers(1, 2**20), st.sampled_from((1, 2, 3, 5, 7, 16)), st.booleans())
+def test_samples_are_divided_into_equal_passes_that_fill_a_grid(
+    sampler: Any, samples: int, cells: int, fits_pixels: bool
+) -> None:
+    """Of the sampler, or of a multiple of `cells` a side where it puts one sample into each cell."""
     count = fitting(sampler, samples)
     assert samples <= count <= 4 * samples + 4
     assert fitting(sampler, count) == count
-    assert fitting(sampler, filling(sampler, samples)) <= max(samples, fitting(sampler, 1))
-    assert plan(samples, sampler).total >= samples
+    assert fitting(sampler, filling(sampler, min(samples, 20_000))) <= max(samples, fitting(sampler, 1))
+    work = on_grid(samples, sampler, cells) if fits_pixels else plan(samples, sampler)
+    assert work.passes >= 16
+    assert work.passes % BATCHES == 0
+    assert work.total >= samples
+    assert work.samples <= (4096 if fits_pixels else 4 * 4096), "float32 sums of more are wrong by over 4e-5"
+    if fits_pixels and sampler in JITTERED:
+        assert isqrt(work.samples) ** 2 == work.samples
+        assert isqrt(work.samples) % cells == 0
+    else:
+        assert fitting(sampler, work.samples) == work.samples
+    if sampler == "multijitter" and not fits_pixels:
+        assert work.total <= 1.5 * samples + 16
+        assert work.samples <= 4096 + 64
 
 
 def errors(
@@ -142,17 +157,6 @@ def test_the_error_of_stratified_samples_is_that_of_the_strata(variant: str) -> 
         assert away <= corners(seen, first**2, last**2) < 0.06
     assert law("independent", seen).slope == -0.5
     assert law("ldsampler", seen).slope is None
-
-
-@given(st.integers(16, 10**6))
-def test_samples_are_divided_into_equal_passes_that_a_grid_can_fill(samples: int) -> None:
-    work = plan(samples)
-    assert work.passes >= 16
-    assert work.passes % BATCHES == 0
-    assert samples <= work.total <= 1.5 * samples + 16
-    side = isqrt(work.samples)
-    assert work.samples % side == 0, "a side of the jittered grid"
-    assert work.samples <= 4096 + 64, "float32 sums of more are wrong by over 4e-5"
 
 
 def test_tally_agrees_with_numpy_even_far_from_zero() -> None:

@@ -14,10 +14,9 @@ from ommatid.scenes.setup import Setup
 from ommatid.scenes.tables.estimation import Sampler
 from ommatid.simulate.adaptive_render import render_until
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.renderer.draws import DIMENSIONS, SobolDraws, sobol_points
+from ommatid.simulate.renderer.draws import DIMENSIONS, SobolDraws
 from ommatid.simulate.renderer.renderer import Renderer
 from ommatid.simulate.renderer.variant import activate
-from ommatid.simulate.sampling.passes import on_grid
 
 from ..examples import needs, with_optics
 
@@ -73,17 +72,6 @@ def test_points_are_uniform_and_those_of_streams_and_seeds_are_unrelated() -> No
         assert abs(np.corrcoef(one, two)[0, 1]) < limit
     between = np.corrcoef(means)
     assert np.abs(between - np.eye(len(means))).max() < limit
-
-
-def test_numbers_of_samples_are_powers_of_two() -> None:
-    for samples in (1, 16, 256, 1000, 40000, 2**20):
-        work = on_grid(samples, "sobol")
-        assert work.total >= samples
-        assert work.samples & (work.samples - 1) == 0
-        assert work.samples <= 4096
-        assert work.passes % 8 == 0
-        assert work.passes >= 16
-    assert sobol_points(256).shape == (DIMENSIONS, 256)
 
 
 def variance(sampler: Sampler, sobol: bool) -> float:

@@ -32,21 +32,6 @@ def test_the_arrays_of_the_paper() -> None:
     assert [gallery(name).measurements for name in ("tile19", "tile35", "tile41")] == [706, 3013, 3746]
 
 
-def test_fit_takes_the_largest_sub_image() -> None:
-    assert [lens_type.pixels for lens_type in gallery("photo").types] == [(79, 79), (47, 47), (59, 59)]
-    assert (gallery("photo").types_seeing() == 3).all(), "a side of 59 = 60 - 1 pixels is seen by all types"
-    assert gallery("single").types[0].pixels == (59, 59)
-
-
-def test_thin_lens_equation_and_magnification() -> None:
-    cam = camera()
-    for lens_type, m in zip(cam.types, (3, 5, 4), strict=True):
-        assert cam.depth(lens_type) / cam.distance == pytest.approx(cam.pixel_pitch / (m * cam.target_pitch))
-        focal = cam.focal_length(lens_type)
-        assert 1 / focal == pytest.approx(1 / cam.distance + 1 / cam.depth(lens_type))
-        assert focal < cam.depth(lens_type)
-
-
 def test_patch_window_and_lens_lie_on_one_line() -> None:
     cam = camera()
     for sub in cam.sub_imagers:

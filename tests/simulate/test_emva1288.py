@@ -319,11 +319,6 @@ def test_quantisation_acts_as_noise_of_a_twelfth_of_the_squared_step(bits: int) 
     assert (levels == np.round(levels)).all()
 
 
-def test_no_noise_changes_nothing() -> None:
-    light = np.linspace(0, 255, 50)
-    np.testing.assert_array_equal(expose(light, NoiseTable(), [], []), light)
-
-
 def test_a_sub_imagers_noise_does_not_depend_on_its_neighbours() -> None:
     three, one = camera(), camera(lenses=THREE[:1])
     noise = NoiseTable(variance=1.0)

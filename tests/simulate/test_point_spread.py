@@ -96,11 +96,6 @@ def test_an_open_pupil_is_airys() -> None:
         np.testing.assert_allclose(spread.transfer(at), mtf, atol=1e-3)
 
 
-@pytest.mark.parametrize("waves", [0.1, 0.21, 0.5])
-def test_strehl_ratio_of_defocus(waves: float) -> None:
-    assert strehl_ratio(defocused(waves)) == pytest.approx(np.sinc(waves) ** 2, abs=1e-9)
-
-
 @pytest.mark.parametrize(("waves", "power"), [(0.1, 2), (0.3, 2), (1.0, 2), (3.0, 2), (1.0, 4), (3.0, 4)])
 def test_defocus_and_primary_spherical_aberration(waves: float, power: int) -> None:
     """Middle, MTF (Hopkins 1955, by direct autocorrelation) and encircled energy against integrals along the radius."""

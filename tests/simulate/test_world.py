@@ -29,7 +29,7 @@ from ommatid.simulate.sampling.passes import Rendering
 
 from ..examples import SLOW_SCALAR, VARIANTS, assert_student, needs
 from ..examples import scene as flat_scene
-from .world_files import FAST, LETTER, THIRDS, Z, cube, floored, glow, rectangle, world
+from .world_files import FAST, THIRDS, Z, floored, glow, rectangle, world
 
 CHECKS = (
     '<emitter type="area"><texture type="checkerboard" name="radiance"><float name="color0" value="1.6"/>'
@@ -110,18 +110,6 @@ def test_a_ball_occludes_the_background(tmp_path: Path, variant: str) -> None:
     np.testing.assert_allclose(found.image[clear], 0.2 * 255, rtol=1e-4)
     assert (np.abs(found.depth[inside] - z) <= radius).all()
     np.testing.assert_allclose(found.depth[clear], 1500, rtol=1e-6)
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_a_letter_f_of_cubes_is_upright_and_not_mirrored(tmp_path: Path, variant: str) -> None:
-    needs(variant)
-    cubes = "".join(cube(5.5 - column, 5.5 - row, Z + 0.05, 0.5, glow(0.8)) for row, column in np.argwhere(LETTER))
-    described, camera = world(tmp_path, cubes, ((1, [1, 1], [12, 12]),), variant=variant)
-    exact = truth(Setup(described, camera))
-    # Float32 may put a few rays on an edge on the wrong side of it.
-    np.testing.assert_allclose(exact.image, LETTER * 204.0, atol=4 * 204 / exact.samples)
-    rendering = light(Setup(described, camera))
-    np.testing.assert_allclose(rendering.mean.reshape(12, 12), LETTER * 204.0, rtol=1e-5, atol=1e-3)
 
 
 @pytest.mark.parametrize("variant", SLOW_SCALAR)

@@ -36,11 +36,6 @@ def rectangle(width: float, height: float, x: float, y: float, z: float, rest: s
         <scale x="{width / 2}" y="{height / 2}"/><translate x="{x}" y="{y}" z="{z}"/></transform>{rest}</shape>"""
 
 
-def cube(x: float, y: float, z: float, half: float, rest: str) -> str:
-    return f"""<shape type="cube"><transform name="to_world"><scale x="{half}" y="{half}" z="0.05"/>
-        <translate x="{x}" y="{y}" z="{z}"/></transform>{rest}</shape>"""
-
-
 def world(
     folder: Path, content: str, lenses: Lenses = THIRDS, target: dict[str, Any] | None = None, **more: Any
 ) -> tuple[Scene, Camera]:

@@ -21,7 +21,7 @@ from ommatid.runtime.arrays import BoolArray, FloatArray, IntArray
 from ommatid.runtime.errors import InputError, named
 from ommatid.runtime.machine import check_memory
 
-from .constants import MOST_DENSE
+from .constants import AIRY_FIRST_ZERO, MOST_DENSE
 from .formats.picture import target_shape
 from .layout import check_overlap, check_sensor, whole_pixels, with_steering
 from .lens_type import LensOptics, LensType, SubImager, adjacent_slices, check_counts
@@ -137,6 +137,10 @@ class Camera:
     def diffusion(self, lens_type: LensType) -> float:
         """Standard deviation of the blur of a type's pixels on the target, in pixels of f; 0 without one."""
         return (lens_type.optics.pixel_blur or 0.0) / self.pixel_pitch * float(lens_type.ratio)
+
+    def airy_pixels(self, lens_type: LensType, aperture: float, wavelength: float) -> float:
+        """Diameter, in sensor pixels, of the Airy disk behind an aperture before a type's sensor."""
+        return 2 * AIRY_FIRST_ZERO * wavelength * self.depth(lens_type) / aperture / self.pixel_pitch
 
     def focal_length(self, lens_type: LensType) -> float:
         """Focal length by the thin-lens equation, 1/focal_length = 1/focus + 1/depth."""

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from math import pi
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy import constants, integrate
+from scipy import constants
 
 from ommatid.analysis.summary import light_rows
 from ommatid.runtime.arrays import FloatArray
@@ -20,7 +19,7 @@ from ommatid.scenes.lens_type import SubImager
 from ommatid.scenes.optics import radiometry, spectrum
 from ommatid.scenes.optics.field import optics_of
 from ommatid.scenes.optics.point_spread import point_spread
-from ommatid.scenes.optics.radiometry import electrons, predicted_noise, solid_angle, summary
+from ommatid.scenes.optics.radiometry import electrons, predicted_noise, summary
 from ommatid.scenes.pose import NO_MISALIGNMENT, Misalignment, pose_of
 from ommatid.scenes.scene import Scene, parse, read, with_changes, write
 from ommatid.scenes.tables.camera import ToleranceTable
@@ -53,15 +52,6 @@ def test_electrons_are_proportional_to_light_and_time() -> None:
         np.testing.assert_allclose(electrons(changed, camera), factor * before, rtol=1e-12)
     red = with_keys(described, camera={"wavelength": 660e-6})
     np.testing.assert_allclose(electrons(red, camera), 660 / 550 * 0.9949501 / 0.061 * before, rtol=1e-6)
-
-
-@pytest.mark.parametrize("aperture", [1e-3, 1.0, 5.0, 1e6])
-def test_the_solid_angle_is_the_integral_over_the_cone(aperture: float) -> None:
-    """The integral of cos sin over the cone of the disk; it is pi for a hemisphere."""
-    edge = np.arctan2(aperture / 2, 2.0)
-    whole, _ = integrate.quad(lambda angle: 2 * pi * np.cos(angle) * np.sin(angle), 0, edge)
-    assert solid_angle(aperture, 2.0) == pytest.approx(whole, rel=1e-9)
-    assert solid_angle(aperture, 2.0) <= pi
 
 
 def angles(camera: Camera, sub: SubImager) -> FloatArray:

@@ -18,13 +18,12 @@ from ommatid.scenes.scene import Scene, parse, read, write
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.render import light
-from ommatid.simulate.sampling.passes import rounding_variance
 
 from ..conftest import Command
-from ..examples import GALLERY, assert_student, needs, scene, slow, with_keys
+from ..examples import GALLERY, needs, scene, slow, with_keys
 from ..frames import assert_acts_as, assert_methods_agree, assert_window, observed
 from ..runs import document
+from ..simulate.world_files import assert_rendered
 
 FINE = 12  # cells of a pixel of f, so that edges of footprints lie on edges of cells
 WINDOWS: dict[tuple[int, int], tuple[Any, Any]] = {(0, 0): (0, 0), (0, 2): ("3/2", 9), (1, 1): (8, "17/4")}
@@ -102,17 +101,6 @@ def test_h_is_that_of_counted_cells(step: str | None) -> None:
     np.testing.assert_array_equal(unrecorded(camera, np.zeros((0, 2), dtype=np.int64)), np.flatnonzero(some))
 
 
-def test_a_right_angle_turns_the_view_clockwise() -> None:
-    """The pixel in the top left corner sees what was in the top right corner."""
-    upright = derive(steered({(0, 1): {"window": [2, 4]}}))
-    turned = derive(steered({(0, 1): {"window": [2, 4], "rotation": "90 deg"}}))
-    before, after = (ideal_matrix(camera).toarray()[9:18] for camera in (upright, turned))
-    pixels = np.arange(9).reshape(3, 3)
-    np.testing.assert_allclose(after, before[np.rot90(pixels).ravel()], atol=1e-12)
-    np.testing.assert_allclose(after[0], before[2], atol=1e-12)
-    np.testing.assert_array_equal(turned.types_seeing(), upright.types_seeing())
-
-
 def test_h_of_a_rotated_sub_imager_is_that_of_points_in_its_pixels() -> None:
     count, camera = 200, derive(steered({(1, 2): {"window": [6, 5], "rotation": f"{ANGLE} rad"}}))
     at = (np.arange(3 * count) + 0.5) / count * 3 - 4.5
@@ -154,10 +142,7 @@ def test_rendered_against_the_closed_form(variant: str, optics: str, rotation: s
         named[1, 1]["rotation"] = rotation
     render = {"variant": variant, "samples": 4096, "complete": True}
     setup = Setup.from_scene(steered(named, more=OPTICS[optics], render=render))
-    rendering = light(setup)
-    samples = rendering.record["samples"] // rendering.passes
-    variance = np.maximum(rendering.variance, rounding_variance(rendering.mean, samples))
-    assert_student(rendering.mean - ideal_matrix(setup.camera) @ setup.image.ravel(), variance, rendering.passes)
+    assert_rendered(setup)
 
 
 @pytest.mark.parametrize(("method", "rotation"), [("transport", "5 deg"), slow("points", None)])

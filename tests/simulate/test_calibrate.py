@@ -113,6 +113,13 @@ def test_a_wrong_entry_disagrees_with_the_ideal_model() -> None:
     assert dark["rms_difference_from_ideal"] > 0
 
 
+def test_ideal_calibration_has_no_uncertainty() -> None:
+    described = scene(calibration={"method": "ideal"})
+    found = calibrate(Setup.from_scene(described))
+    assert not found.variance.any()
+    assert not found.variance_from_model(load(described)).any()
+
+
 def test_a_model_file_gives_the_same_model(tmp_path: Path) -> None:
     described = small()
     found = calibrate(Setup.from_scene(described))

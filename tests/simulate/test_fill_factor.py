@@ -21,7 +21,7 @@ from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import designed_kernels, ideal_matrix, ideal_model, true_matrix
 from ommatid.simulate.render import render
 
-from ..examples import THREE, Lenses, assert_student, inside_interval, needs, scene, with_optics
+from ..examples import THREE, Lenses, inside_interval, needs, scene, with_optics
 from ..frames import assert_methods_agree, recorded, wide
 from ..lenses import BICONVEX
 from ..scenes.mosaics import NOISE, SCENE, as_mosaic
@@ -104,28 +104,6 @@ def test_kernels_are_the_entries(name: str, part: Part, blur: dict[str, Any]) ->
     exact = ideal_matrix(camera).toarray()
     assert np.abs(kernels - exact).max() < 4e-3 * exact.max()
     assert exact.sum(axis=1).max() <= float(camera.types[0].light) + 1e-9
-
-
-@pytest.mark.parametrize("part", [pytest.param("1/2", marks=SLOW), "2/3", ["1/3", "1"]])
-@pytest.mark.parametrize("name", SLOW_SURFACES)
-def test_rays_measure_the_closed_form(name: str, part: Part) -> None:
-    """Entry by entry: squared errors over their variances have mean 1.
-
-    But for what closed forms of blur neglect, the variation of the light's weight within a pixel: up to 1.25 here.
-    """
-    needs("llvm_ad_mono")
-    lens, table = OPTICS[name]
-    samples = {"samples": 2048, "method": "transport", "fit": "none"}
-    optics = ROOM | table | {"fill_factor": part}
-    described, camera = with_optics(lens, optics, LENS, SHAPE, calibration=samples, render={"sampler": "independent"})
-    model = calibrate(Setup.from_scene(described))
-    difference = (model.matrix - true_matrix(camera)).toarray()
-    at = np.repeat(np.arange(144), np.diff(model.matrix.indptr)), model.matrix.indices
-    likely = model.matrix.data > 0.02 * model.matrix.data.max()  # the others are hit by few rays
-    assert_student(difference[at][likely], model.variance[likely], model.record["passes"])
-    scores = np.square(difference[at][likely]) / model.variance[likely]
-    error, neglected = 4 * scores.std(ddof=1) / scores.size**0.5, 0.25 * camera.is_blurred(camera.types[0])
-    assert 1 - error < scores.mean() < 1 + error + neglected
 
 
 @pytest.mark.parametrize("part", [["1/3", "1"], ["1/2", "2/3"], ["1", "1/3"]])

@@ -24,7 +24,9 @@ from ommatid.simulate.renderer.variant import choose
 from ommatid.simulate.renderer.worlds.placement import MILLIMETRES_AT_ORIGIN
 from ommatid.simulate.sampling.passes import Plan
 
-from ..examples import OPTICS, familywise, needs, with_optics
+from ..examples import OPTICS, familywise, needs, slow, with_optics
+from .test_fill_factor import BLUR, LENS, ROOM, SHAPE
+from .test_fill_factor import OPTICS as OPENED
 from .test_lens_matrix import BENT, FLAT, ONE
 from .world_files import distance_to_target
 
@@ -49,6 +51,18 @@ SURFACES: dict[str, Any] = {
     "surfaces with coma": ({"surfaces": BENT}, {"wavelength": "550 nm"}, *SMALL),
     "rays through surfaces": ({"surfaces": FLAT, "focus": "300 mm"}, RAYS, *SMALL),
     "rays with coma": ({"surfaces": BENT}, RAYS, *SMALL),
+}
+SLIT = {"fill_factor": ["1/3", "1"]}
+PIXELS: dict[str, Any] = {  # that are open in part, or blur
+    f"{name}, {kind}": (lens, ROOM | table | pixels, LENS, SHAPE)
+    for name, (lens, table) in OPENED.items()
+    for kind, pixels in {
+        "open": {"fill_factor": "2/3"},
+        "slit": SLIT,
+        "blur": BLUR,
+        "blur and slit": SLIT | BLUR,
+    }.items()
+    if "blur" not in kind or name in ("pinholes", "diffracting", "out of focus", "surfaces")
 }
 INDEPENDENT: dict[str, Any] = {"sampler": "independent", "complete": True}
 
@@ -85,16 +99,25 @@ def assert_scores(found: FloatArray, fewest: int = 200) -> None:
     assert float(np.square(found).mean()) == pytest.approx(1, abs=5 * (2 / found.size) ** 0.5)
 
 
-@pytest.mark.parametrize("kind", [*CLOSED, *SURFACES])
-def test_traced_h_is_the_closed_form(kind: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "detail"),
+    [
+        *((kind, 1) for kind in (*CLOSED, *SURFACES)),
+        *(slow(kind, 1) if "surfaces" in kind else (kind, 1) for kind in PIXELS),
+        *(slow(kind, 3) for kind in PIXELS if "blur" in kind),
+    ],
+)
+def test_traced_h_is_the_closed_form(kind: str, detail: int) -> None:
     needs("llvm_ad_mono")
-    optics: Any = (CLOSED | SURFACES)[kind]
-    described, camera = with_optics(*optics, calibration={"samples": SAMPLES}, render=INDEPENDENT)
-    traced = measured(Setup(described, camera), by_points=False)
+    optics: Any = (CLOSED | SURFACES | PIXELS)[kind]
+    tables: Any = {"calibration": {"samples": SAMPLES}, "render": INDEPENDENT, "target": {"detail": detail}}
+    setup = Setup(*with_optics(*optics, **tables)).calibrated
+    camera, traced = setup.camera, measured(setup, by_points=False)
     rays = float(traced.work.total)
     if kind in SURFACES and camera.wavelength is None:  # rays leave through the whole exit disk: some are blocked
         rays *= float(optics_of(camera, camera.types[0], None).lit_share(np.zeros(1))[0])
-    assert_scores(scores(traced.matrix, true_matrix(camera), rays), 5000 if kind in CLOSED else 300)
+    exact = sparse.csr_array(true_matrix(camera) / float(camera.types[0].light))
+    assert_scores(scores(traced.matrix, exact, rays), 5000 if kind in CLOSED else 300)
 
 
 @pytest.mark.slow

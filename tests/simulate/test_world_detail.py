@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from ommatid.reconstruct.output.result_files import truth_beside
 from ommatid.runtime.errors import InputError
@@ -18,9 +17,9 @@ from ommatid.scenes.scene import Scene, write
 from ommatid.scenes.setup import Setup
 from ommatid.simulate.calibrate import calibrate
 from ommatid.simulate.ideal import ideal_matrix
-from ommatid.simulate.render import light
 from tests.conftest import Command
 from tests.examples import needs, scene, with_optics
+from tests.simulate.world_files import assert_rendered
 
 SMALL = (("1/3", [3, 3], [3, 3]), ("1/2", [2, 2], [5, 5]))
 
@@ -61,11 +60,7 @@ def test_a_finer_world_describes_the_same_camera() -> None:
 def test_the_fine_picture_is_rendered() -> None:
     needs("llvm_ad_mono")
     setup = Setup.from_scene(detailed(4, render={"samples": 4096}))
-    rendering = light(setup)
-    exact = ideal_matrix(setup.world.camera) @ setup.world.image.ravel()
-    score = (rendering.mean - exact) / np.sqrt(rendering.stated)
-    smallest = 2 * float(stats.t.sf(np.abs(score).max(), rendering.passes - 1))
-    assert 1 - (1 - smallest) ** score.size > 1e-3
+    rendering, exact = assert_rendered(setup), ideal_matrix(setup.world.camera) @ setup.world.image.ravel()
     blurred = ideal_matrix(replace(setup.camera, detail=1)) @ setup.image.ravel()
     assert np.abs(blurred - exact).max() > 10 * np.abs(rendering.mean - exact).max(), (
         "detail is seen: 12.7 for the worst of 12 seeds"

@@ -10,9 +10,12 @@ import numpy as np
 
 from ommatid.scenes.camera import Camera, derive
 from ommatid.scenes.scene import Scene, parse
+from ommatid.scenes.setup import Setup
+from ommatid.simulate.ideal import ideal_matrix
+from ommatid.simulate.render import light
 from ommatid.simulate.sampling.passes import Rendering, rounding_variance
 
-from ..examples import Lenses
+from ..examples import Lenses, assert_student
 from ..examples import scene as flat_scene
 
 if TYPE_CHECKING:
@@ -56,6 +59,14 @@ def world(
 def floored(rendering: Rendering) -> Any:
     samples = rendering.record["samples"] // rendering.passes
     return np.maximum(rendering.variance, rounding_variance(rendering.mean, samples))
+
+
+def assert_rendered(setup: Setup) -> Rendering:
+    """Assert that rendered readings are those of the closed form, and return them."""
+    rendering = light(setup)
+    exact = ideal_matrix(setup.world.camera) @ setup.world.image.ravel()
+    assert_student(rendering.mean - exact, floored(rendering), rendering.passes)
+    return rendering
 
 
 def distance_to_target(renderer: Renderer) -> Distance:

@@ -19,7 +19,7 @@ from typing import Any
 from ommatid.runtime.arrays import FloatArray
 
 from ..camera import Camera
-from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
+from ..constants import GREEN, WHITE
 from ..layout import sensor_extent
 from ..lens_type import LensType
 from ..scene import Scene
@@ -132,7 +132,6 @@ def _lens_terms(camera: Camera, lens_type: LensType, wavelength: float) -> LensT
     depth, focal_length = camera.depth(lens_type), camera.focal_length(lens_type)
     aperture = lens_type.optics.aperture
     height, width = (count * camera.pixel_pitch for count in lens_type.pixels)
-    airy = None if aperture is None else 2 * AIRY_FIRST_ZERO * wavelength * depth / aperture / camera.pixel_pitch
     return LensTerms(
         name=lens_type.name,
         grid_magnification=1 / lens_type.ratio,
@@ -141,7 +140,7 @@ def _lens_terms(camera: Camera, lens_type: LensType, wavelength: float) -> LensT
         aperture=aperture,
         f_number=None if aperture is None else focal_length / aperture,
         field_of_view=(degrees(2 * atan(height / 2 / depth)), degrees(2 * atan(width / 2 / depth))),
-        airy_diameter=airy,
+        airy_diameter=None if aperture is None else camera.airy_pixels(lens_type, aperture, wavelength),
         total_track=depth,
         sub_image=(height, width),
         lenses=lens_type.count,
@@ -204,14 +203,12 @@ def _left_out(camera: Camera, terms: OpticalTerms) -> list[str]:
 
 
 def _pinholes(camera: Camera, terms: OpticalTerms) -> list[str]:
-    def narrowest(lens: LensTerms) -> float:
-        return 2 * AIRY_FIRST_ZERO * GREEN * lens.total_track / camera.lens_pitch / camera.pixel_pitch
-
+    narrowest = {lens_type.name: camera.airy_pixels(lens_type, camera.lens_pitch, GREEN) for lens_type in camera.types}
     pinholes = [lens for lens, kind in zip(terms.types, camera.types, strict=True) if not kind.optics.has_width]
-    wide = [lens for lens in pinholes if narrowest(lens) > WIDEST]
+    wide = [lens for lens in pinholes if narrowest[lens.name] > WIDEST]
     if not wide:
         return []
-    disks = _each(wide, lambda lens: f"{narrowest(lens):.2g}")
+    disks = _each(wide, lambda lens: f"{narrowest[lens.name]:.2g}")
     return [
         f"diffraction is not modelled: set camera.lens.{wide[0].name}.aperture or f_number; even behind an aperture of"
         f" the lens pitch, the Airy disk of {disks} sensor pixels wide at 550 nm"

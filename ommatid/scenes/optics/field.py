@@ -395,6 +395,12 @@ def reach(camera: Camera, lens_type: LensType) -> tuple[float, float, float]:
     return float(far), float(-points[:, 2].max()), float(-points[:, 2].min())
 
 
+def vergence_shifts(camera: Camera, lens_type: LensType) -> tuple[float, float]:
+    """Return the least and largest change of a target's vergence that the depths of a type's sensor points make."""
+    (_, least, largest), depth = reach(camera, lens_type), camera.depth(lens_type)
+    return 1 / largest - 1 / depth, 1 / least - 1 / depth
+
+
 def exit_disk_of(camera: Camera, lens_type: LensType, prescription: Prescription) -> Disk:
     """Return the exit disk for every sensor point of a lens type."""
     field, least, largest = reach(camera, lens_type)

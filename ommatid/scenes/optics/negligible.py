@@ -18,7 +18,7 @@ import numpy as np
 from scipy import sparse, special
 
 from ..camera import Camera
-from ..constants import AIRY_FIRST_ZERO, GREEN, WHITE
+from ..constants import GREEN, WHITE
 from ..lens_type import LensType
 from ..scene import Scene
 from ..tables.estimation import PriorTable
@@ -115,8 +115,7 @@ def _negligible_diffraction(
             return None
         if lens_type.optics.aperture is None:
             continue
-        disk = 2 * AIRY_FIRST_ZERO * wavelength * camera.depth(lens_type) / lens_type.optics.aperture
-        disk = disk / camera.pixel_pitch
+        disk = camera.airy_pixels(lens_type, lens_type.optics.aperture, wavelength)
         if disk >= MOST_AIRY:
             return None
         change, mean_square = _change(camera, replace(camera, wavelength=None), lens_type, lens_type, prior)
@@ -287,7 +286,7 @@ def _without_aperture(camera: Camera, pinholes: list[LensType]) -> SkippedEffect
 def _at_lens_pitch(camera: Camera, lens_type: LensType) -> tuple[float, float, float]:
     """The f-number of an aperture of the lens pitch, its Airy disk in sensor pixels, and a bound on its effect."""
     number = camera.depth(lens_type) / camera.lens_pitch
-    width = 2 * AIRY_FIRST_ZERO * GREEN * number / camera.pixel_pitch
+    width = camera.airy_pixels(lens_type, camera.lens_pitch, GREEN)
     return number, width, WHITE * (1 - light_kept_in_focus(camera.pixel_pitch / (GREEN * number)))
 
 

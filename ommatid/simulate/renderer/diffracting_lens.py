@@ -21,7 +21,7 @@ from ommatid.runtime.arrays import Float32Array, FloatArray
 from ommatid.scenes.camera import Camera
 from ommatid.scenes.lens_type import LensType
 from ommatid.scenes.optics.diffraction import QUANTILES, pattern
-from ommatid.scenes.optics.field import reach
+from ommatid.scenes.optics.field import vergence_shifts
 
 from .lens import Distance, Emission, LensModel, Point, drawn_bands, falloff, through_thin_lens
 from .loaded import dr, mi
@@ -50,15 +50,13 @@ class DiffractingLens(LensModel):
         self._depth, self._focus = camera.depth(lens_type), camera.focus(lens_type)
         self._weight = (aperture / (2 * self._depth)) ** 2
         self._wavelengths, self._shares = zip(*camera.wavelengths, strict=True)
-        _, least, largest = reach(camera, lens_type)
-        self._tabulate([1 / camera.distance_of(lens_type) + 1 / depth - 1 / self._depth for depth in (least, largest)])
+        self._shifts = vergence_shifts(camera, lens_type)
+        self._tabulate([1 / camera.distance_of(lens_type) + shift for shift in self._shifts])
 
     def follow(self, distance: Distance) -> None:
         """Let rays have the pattern of the distance of the surface that they meet."""
         self.distance = distance
-        _, least, largest = reach(self._camera, self._type)
-        shifts = [1 / depth - 1 / self._depth for depth in (least, largest)]
-        self._tabulate([1 / (NEAR * self._aperture) + max(shifts), min(shifts)])
+        self._tabulate([1 / (NEAR * self._aperture) + self._shifts[1], self._shifts[0]])
         self.captured = 1.0  # rays go where the rest of the light lands, too
 
     def _waves(self, vergence: Any, wavelength: float) -> Any:

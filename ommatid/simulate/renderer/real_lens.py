@@ -22,9 +22,9 @@ from ommatid.scenes.optics.field import (
     check_waves,
     exit_disk_of,
     prescription_of,
-    reach,
     sampling_tables,
     surface_optics,
+    vergence_shifts,
 )
 from ommatid.scenes.optics.ray_trace import Functions, path, trace
 from ommatid.scenes.optics.wavefront import GRID_REACH
@@ -73,8 +73,7 @@ class WaveLens(RealLens):
         self._fields, self._depth, self._vergence = fields, camera.depth(lens_type), 1 / camera.distance_of(lens_type)
         self._focus = 1 / camera.focus(lens_type)
         self._distance: Distance | None = None
-        _, least, largest = reach(camera, lens_type)
-        self._shifts = [1 / depth - 1 / self._depth for depth in (largest, least)]
+        self._shifts = vergence_shifts(camera, lens_type)
         self._tabulate([self._vergence + shift for shift in self._shifts], CELLS, GRID_REACH)
 
     def follow(self, distance: Distance) -> None:

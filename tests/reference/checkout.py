@@ -93,8 +93,7 @@ class Checkout:
         emptied(folder)
         case.write(folder)
         code, message, seconds = 0, "", 0.0
-        export = "export" if self._merges_exports() else "export-model"
-        for words in (*case.commands, (export, f"{case.result}/model.npz", "-o", MATRIX)):
+        for words in (*case.commands, ("export", f"{case.result}/model.npz", "-o", MATRIX)):
             more = [part for setting in self.settings for part in ("--set", setting)] if words[0] == "run" else []
             code, message, spent = self.command((*words, *more), folder)
             seconds += spent
@@ -103,11 +102,6 @@ class Checkout:
         ended = {"code": code, "message": message, "seconds": seconds}
         (folder / DONE).write_text(json.dumps({"key": key, **ended}), encoding="utf-8")
         return Done(folder, code, message, seconds)
-
-    def _merges_exports(self) -> bool:
-        """Return True if `export` takes models, too, as it does since `export-model` was withdrawn."""
-        failures = self.folder / "ommatid" / "cli" / "failures.py"
-        return failures.exists() and '"export-model": ' in failures.read_text(encoding="utf-8")
 
     def command(self, words: Words, folder: Path) -> tuple[int, str, float]:
         """Run one command: its exit code, the last line of its messages, and its processor seconds."""

@@ -193,7 +193,7 @@ def test_a_finished_case_is_not_run_again_by_the_same_program(tmp_path: Path, mo
 
     assert [ended().reused, ended().reused] == [False, True]
     words = (tmp_path / "store" / "once" / "words.txt").read_text().splitlines()
-    assert words == ["run a.toml --set render.seed=1", "reconstruct b.exr", "export-model out/model.npz -o H.npz"]
+    assert words == ["run a.toml --set render.seed=1", "reconstruct b.exr", "export out/model.npz -o H.npz"]
     (program / "ommatid" / "__main__.py").write_text(PROGRAM.format(code="1 + 2"))  # of another length: bytecode
     failed = ended()
     assert (failed.code, failed.reused, failed.message) == (3, False, "run: no message")

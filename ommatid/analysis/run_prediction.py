@@ -27,7 +27,7 @@ from ommatid.reconstruct.misalignment.moments import (
     mismatch_of_image,
     mismatch_variance,
 )
-from ommatid.reconstruct.noise import undithered
+from ommatid.reconstruct.noise import OVEREXPOSED, overexposed, undithered, usable_pixels
 from ommatid.reconstruct.prediction import Prediction, observability
 from ommatid.reconstruct.prior import Prior
 from ommatid.reconstruct.restore import BUDGET, truth_for
@@ -42,6 +42,7 @@ from ommatid.scenes.tables.estimation import PriorTable
 from .predicted_recording import PredictedRecording, predicted_recording, recording_without_rays
 
 MODEL = "model"  # in the budget: H as designed is not that of the lenses
+UNPREDICTED = "is seen by saturated pixels alone, and what the light beyond their limit adds to the error is left out"
 BY_TRANSFER = "Eq. 5 by transfer functions, with edges, to 2 %"
 BY_MEANS = "Eq. 5 by transfer functions of the mean over each lens's field, to 5 %"
 
@@ -94,6 +95,7 @@ def predict_without_rays(setup: Setup, assumes: tuple[str, ...], *, picture: boo
     # In front of detail no wave is hidden exactly, but the error of a picture by nearly hidden ones is its own.
     null_space = leaves_null_space(camera) and (picture or not camera.has_detail)
     alike = camera.is_sliding and camera.tolerance is None and not null_space
+    alike = alike and overexposed(model, usable_pixels(stack, model)) <= OVEREXPOSED
 
     def work(choice: MethodChoice) -> _Outcome:
         quick = alike and choice.method == "frame"
@@ -139,6 +141,9 @@ def _reconstructed(recording: PredictedRecording) -> _Outcome:
 
 def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) -> Prediction:
     expected, given, camera = outcome.result.expected, outcome.result.interval, setup.camera
+    hidden = overexposed(outcome.assumed.method.task.model, outcome.assumed.usable)
+    if hidden > OVEREXPOSED:
+        given = None  # its error depends on how far the light exceeds the limit
     mismatch = _mismatch(setup, recording, outcome)
     variance = expected.variance if mismatch is None else expected.variance + mismatch.variance
     parts = {"null_space": expected.missing, **expected.parts}
@@ -163,6 +168,7 @@ def _prediction(setup: Setup, recording: PredictedRecording, outcome: _Outcome) 
         budget=budget,
         assumes=(
             *recording.assumes,
+            *((f"{100 * hidden:.3g} % of the image {UNPREDICTED}",) if hidden > OVEREXPOSED else ()),
             *(() if mismatch is None else mismatch.assumes),
             *assumptions(setup.scene, setup.camera),
         ),

@@ -49,6 +49,8 @@ UNCHANGED = 0.05  # standard deviations of its noise: change of the light expect
 BEFORE_ROUNDING = ("noise", "rendering")  # by cause
 DITHER = 0.4  # noise over the quantisation step from which rounding errors are independent of the signal
 HARMONICS = 20  # of the mean error of rounding; those beyond are 3 % of its variance without noise
+LEAST_EXPOSED = 1e-3  # of the light that a pixel sends to saturated sensor pixels, below which others do not see it
+OVEREXPOSED = 1e-3  # share of an image that only saturated pixels see, from which it matters
 LEAST_INFORMATION = 0.01  # of an unsaturated pixel: a saturated one with less is left out
 
 
@@ -86,6 +88,14 @@ def usable_pixels(stack: Stack, model: Model | None = None) -> UsablePixels:
         # A stack that was stored holds float32.
         full = alive & (stack.values >= min(noise.saturation, float(np.float32(noise.saturation))))
     return UsablePixels(alive & ~full, int(np.sum(~alive)), full)
+
+
+def overexposed(model: Model, usable: UsablePixels) -> float:
+    """Return the share of the pixels of H's images that saturated sensor pixels see and no others."""
+    if not usable.saturated:
+        return 0.0
+    exposed, seen = (model.adjoint(each.astype(np.float64)) for each in (usable.used & ~usable.full, usable.full))
+    return float(np.mean(exposed < LEAST_EXPOSED * seen))
 
 
 def known_noise(stack: Stack, light: FloatArray | None = None) -> Noise:

@@ -28,7 +28,7 @@ from .expected_error import ExpectedError, Interval
 from .measured_error import MeasuredError, measure_error, trimmed_mean
 from .method_choice import MethodChoice
 from .methods.method import EstimationTask, Execution, Method, MethodResult, Prepared, total_variance
-from .noise import Noise, UsablePixels, undithered
+from .noise import Noise, UsablePixels, overexposed, undithered
 from .output.run_json import ResidualPart, ResidualReport, SolverReport, VerdictReport
 from .prior_fit import PriorFit
 from .verdict.causes import likely_cause
@@ -76,6 +76,7 @@ def verdict_of(
         undithered=undithered(assumed.noise),
         rounding_share=_rounding_share(assumed.noise),
         pixels_used=int(used.sum()),
+        overexposed=overexposed(assumed.method.task.model, assumed.usable),
         left_out=without_pixels(stack.camera, used),
         more_samples=MORE_SAMPLES.get(model.record["method"], "measure H more accurately"),
     )

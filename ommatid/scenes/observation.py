@@ -344,7 +344,8 @@ class Observation:
         pairs = zip(self.slices, self.parts, strict=True)
         chosen = [(place.start, part, (numbers >= place.start) & (numbers < place.stop)) for place, part in pairs]
         found = [part.rows_on(numbers[own] - start, rows, columns) for start, part, own in chosen if own.any()]
-        return sparse.csr_array(sparse.vstack(found, format="csr"))
+        empty = sparse.csr_array((0, (rows.stop - rows.start) * (columns.stop - columns.start)))
+        return sparse.csr_array(sparse.vstack([empty, *found], format="csr"))
 
     def signature(self, rows: slice, columns: slice) -> Hashable:
         """Return a key that is equal for two windows only if their submatrices are equal."""

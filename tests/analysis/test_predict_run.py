@@ -34,6 +34,21 @@ DIFFRACTION = (*BLUR, 'camera.wavelength="550 nm"', 'camera.lens_pitch="1 mm"')
 DISTORTION = tuple(f"camera.lens.{name}.distortion=[0.05,0.02]" for name in ("I", "II", "III"))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [1, 150])
+def test_an_overexposed_frame_has_the_error_of_the_dense_problem(limit: int) -> None:
+    """Transfer functions of its mean weights would spread what the saturated region lacks over all of it."""
+    changes = (f"noise.saturation={limit}", "target.shape=[47,47]")
+    frame, dense = (
+        predict_scene(read(GALLERY / "photo.toml", (*changes, *each)), rays=False)
+        for each in (("estimator.method=frame",), ())
+    )
+    assert (frame.method, dense.method) == ("frame", "covariance")
+    assert frame.mse == pytest.approx(dense.mse, rel=5e-3)
+    assert frame.mse_for_picture is None
+    assert any("saturated pixels alone" in words for words in frame.assumes)
+
+
 @pytest.mark.parametrize(
     ("changes", "lenses"),
     [

@@ -10,6 +10,7 @@ import pytest
 from scipy import fft, linalg
 
 from ommatid.reconstruct.frame.conjugate_gradients import ACCURACY, FrameSystem, Refined, Solution
+from ommatid.reconstruct.frame.unseen import with_unseen
 from ommatid.reconstruct.prior import spectrum_of
 from ommatid.runtime.arrays import FloatArray
 from ommatid.runtime.errors import InputError
@@ -158,6 +159,30 @@ def test_steps_with_a_cheaper_h_solve_for_the_exact_one(noise: float) -> None:
     assert np.abs((solution.image - image) / deviations).max() <= solution.bound <= ACCURACY
     designed = frame_system(CAMERA, np.full(CAMERA.measurements, 1.0))
     assert Refined.of(designed, designed.preconditioner) is designed.preconditioner
+
+
+@pytest.mark.parametrize("correlated", [True, slow(False)])
+def test_a_region_without_readings_is_that_of_the_dense_problem(correlated: bool) -> None:
+    """As where all saturate. Without its own part of the preconditioner twice the steps lead nowhere near it."""
+    camera, rng = frame_camera((37, 37)), np.random.default_rng(1)
+    row, column = np.indices(camera.shape)
+    region = (np.hypot(row - 17, column - 19) < 9).astype(np.float64)
+    matrix = observed(camera).to_sparse()
+    weights = np.where(matrix @ region.ravel() > 0, 0.0, 100.0)
+    prior = spectrum_of(CORRELATED["exponential"], camera.shape, camera.target_pitch) if correlated else P0
+    system = frame_system(camera, weights, prior)
+    hidden = (matrix.T @ weights == 0) & (matrix.T @ np.ones(weights.size) > 0)
+    np.testing.assert_array_equal(system.unseen.ravel(), hidden)
+    assert hidden.sum() >= region.sum()
+    apart = replace(system, similar=with_unseen(system, system.bands))
+    white = rng.normal(size=camera.shape) * np.sqrt(prior)
+    image = (fft.idctn(white, 2, norm="ortho") if correlated else white).ravel()
+    right = system.apply(image)
+    solution = apart.solve(right)
+    dense = np.array([system.apply(pixel) for pixel in np.eye(camera.unknowns)])
+    deviations = np.sqrt(np.diagonal(np.linalg.inv(dense)))
+    assert np.abs((solution.image - image) / deviations).max() <= solution.bound <= ACCURACY
+    assert replace(system, similar=system.bands).steps(right, 2 * solution.steps)[1] > 100 * ACCURACY
 
 
 def uneven(camera: Camera) -> FloatArray:

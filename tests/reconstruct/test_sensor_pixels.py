@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, stats
 
-from ommatid.reconstruct.noise import censored, common_rounding, usable_pixels
+from ommatid.reconstruct.noise import censored, common_rounding, overexposed, usable_pixels
 from ommatid.reconstruct.output import facts
 from ommatid.reconstruct.output.report import report_of
 from ommatid.reconstruct.restore import Reconstruction, restore
@@ -82,6 +82,23 @@ def test_saturated_pixels_are_known_to_reach_the_limit(bits: int | None) -> None
     assert restoration.residual is not None
     assert abs(restoration.residual.chi_squared - restoration.residual.expected) < 4 * restoration.residual.deviation
     assert abs(used.chi_squared - used.expected) > 4 * used.deviation
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_region_that_saturated_pixels_alone_see_is_not_trusted(known: bool) -> None:
+    """Whether the truth is known or not: by how much the light there exceeds the limit, no reading tells."""
+    described = scene(lenses=THREE, noise={"variance": 1.0, "saturation": 200.0})
+    stack, model, truth = recording(described)
+    row, column = np.indices(stack.camera.shape)
+    truth = np.where(np.hypot(row - 9, column - 8) < 7, 250.0, np.minimum(truth, 170.0).reshape(row.shape)).ravel()
+    values = expose(model.forward(truth), not_none(described.noise), generators(stack.camera, 3), stack.camera.slices())
+    result = restore(replace(stack, values=values), model, truth if known else None)
+    hidden = model.adjoint(np.where(result.usable.full, 0.0, 1.0)) == 0
+    assert overexposed(model, result.usable) == hidden.mean() > 0.05
+    assert result.verdict.level == "red"
+    assert any("seen by saturated sensor pixels alone" in reason for reason in result.verdict.reasons)
+    squares = np.square(result.estimate - truth) / result.expected.variance
+    assert np.median(squares[~hidden]) < 1 < np.median(squares[hidden])
 
 
 @pytest.mark.slow

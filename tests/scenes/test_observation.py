@@ -95,6 +95,10 @@ def test_an_image_of_larger_pixels_reads_as_the_world_that_repeats_them(optics: 
     whole = coarse.to_sparse()[numbers].toarray().reshape(-1, 11, 12)
     cut = coarse.rows_on(numbers, rows, columns).toarray().reshape(-1, 5, 7)
     np.testing.assert_allclose(cut, whole[:, rows, columns], atol=1e-15)  # of measurements that see more, too
+    assert coarse.rows_on(numbers[:0], rows, columns).shape == (
+        0,
+        35,
+    )  # of a window all of whose readings are saturated
     everything = np.sort(coarse.measurements_inside(slice(0, 11), slice(0, 12)))
     np.testing.assert_array_equal(everything, np.arange(camera.measurements))
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg, sparse
 
-from ommatid.runtime.arrays import FloatArray
+from ommatid.runtime.arrays import BoolArray, FloatArray
 from ommatid.runtime.errors import InputError
 from ommatid.runtime.machine import one_thread, processors
 from ommatid.runtime.progress import Progress, no_progress
@@ -50,6 +50,7 @@ TRIAL_STEPS = 10  # with each of two preconditioners, where noise is uneven
 REDUCTION = 0.1  # of a residual by steps with a cheaper H; more of them would follow what it lacks
 MOST_INNER, MOST_OUTER = 60, 100  # such steps, and times that they are taken
 LEAST_LOCAL = 1e-3  # of the weights of a pixel's measurements, relative to their mean
+ROUNDING = 1e-12  # of such weights, below which they are 0
 
 
 class Preconditioner(Protocol):
@@ -144,6 +145,12 @@ class FrameSystem:
         """H^T w of the weights, and of their means over each lens type: (N,) each."""
         means = np.repeat(self.mean_weights, [part.stop - part.start for part in self.types])
         return self.observation.adjoint(self.weights), self.observation.adjoint(means)
+
+    @cached_property
+    def unseen(self) -> BoolArray:
+        """True for pixels that no used measurement sees, though others do: (rows, columns)."""
+        local, average = self._local_weights
+        return (local <= ROUNDING * average).reshape(self.shape) & (average > 0).reshape(self.shape)
 
     def _fastest(self, *candidates: Bands) -> Bands:
         return candidates[0] if len(candidates) == 1 else min(candidates, key=self._after_trial)

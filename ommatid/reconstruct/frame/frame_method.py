@@ -46,6 +46,7 @@ from .conjugate_gradients import (
 )
 from .error_map import MANY, ErrorMap, error_map, is_invariant
 from .reading_space import ReadingSpace, moments_of
+from .unseen import with_unseen
 from .variance_map import VarianceMap, mean_ratios
 from .windows import of_mean_kernels
 
@@ -55,6 +56,7 @@ ELSEWHERE = "the lens types do not see alike everywhere: windows give the error 
 WORLD = "the world finer than f is estimated, and f's pixels are its averages"
 MEAN_ACCURACY = 0.01  # of operators for means over the frame, in posterior standard deviations
 SOLVING = 0.3  # share of the time that the estimate takes; the error analysis takes the rest
+LEAST_WEIGHT = 1e-300  # of lens types whose pixels are all saturated
 SIMILAR = 0.1  # relative difference of mean weights up to which a preconditioner serves, which costs a step at most
 ERRORS = "errors"  # name of a FrameError among what frames share
 DRAWS = 2  # of images and noise for the expected residual, at least
@@ -113,11 +115,11 @@ class FrameMethod(Method):
             space = ReadingSpace(self.task, system, found, np.array(self.task.expected_noise))
             if space.is_regular:
                 return replace(system, similar=space)
-        variances = np.divide(1, system.mean_weights, dtype=np.float64)
+        variances = 1 / np.maximum(system.mean_weights, LEAST_WEIGHT)
         conditions = replace(self.conditions(), used=np.ones(0, np.bool_), assumed=variances)
         nearly = replace(system, observation=of_mean_kernels(system.observation))  # in which steps are fast
         similar, _ = self.shared("preconditioner", conditions, lambda: nearly.preconditioner, SIMILAR)
-        return replace(system, similar=Refined.of(system, similar))
+        return replace(system, similar=Refined.of(system, with_unseen(system, similar)))
 
     @cached_property
     def solution(self) -> Solution:

@@ -16,7 +16,7 @@ from ommatid.runtime.arrays import BoolArray
 from ommatid.scenes.camera import Camera
 
 from ..expected_error import Interval
-from ..noise import DITHER
+from ..noise import DITHER, OVEREXPOSED
 from ..output.run_json import ResidualPart, VerdictReport
 from .causes import MOST_NAMED, listed, named
 from .residual import sidak
@@ -30,6 +30,7 @@ APART = 1.5  # ratio of the RMS error to expect for a picture to the stated one,
 PEAKED, POINTS = 7.0, 20.0  # kurtosis of an estimate from which it is worth a note, and a doubt
 LEAST_HIDDEN = 0.3  # share of the prior's part in the error, below which the picture's contrast hardly matters to it
 LEAST_LOSS = 0.05  # dB below the best single sub-image, which round to 0.1
+MOST_OVEREXPOSED = 0.02  # share of an image that only saturated pixels see, from which the whole is not to be trusted
 SPURIOUS_SHARE = 0.05  # of the information on a pixel, above which the noise of H is worth a note
 
 
@@ -51,6 +52,7 @@ class ErrorCheck:
     kurtosis : of the estimate in units of the prior, 3 for images of the prior
     undithered : noise over the quantisation step, None where it is large enough to make rounding errors independent
     rounding_share : of the noise
+    overexposed : share of the image that saturated sensor pixels alone see
     pixels_used : sensor pixels;  left_out : sub-imagers without any usable pixel, by name
     more_samples : how to reduce the uncertainty of H
     """
@@ -69,6 +71,7 @@ class ErrorCheck:
     noise_fitted: bool
     undithered: float | None
     rounding_share: float
+    overexposed: float
     pixels_used: int
     left_out: tuple[str, ...]
     more_samples: str
@@ -270,6 +273,11 @@ def _judge_assumptions(check: ErrorCheck, findings: _Findings) -> None:
         (findings.doubts if check.kurtosis >= POINTS else findings.notes).append(
             f"the picture's contrast lies in few places, such as points or edges (kurtosis {check.kurtosis:.2g}, 3 for"
             " the prior's images): error bars are averages, smaller than the errors there and larger elsewhere"
+        )
+    if check.overexposed > OVEREXPOSED:
+        (findings.reasons if check.overexposed > MOST_OVEREXPOSED else findings.doubts).append(
+            f"{100 * check.overexposed:.3g} % of the image is seen by saturated sensor pixels alone: it is a lower"
+            " bound there, and its error bars are too small; expose less, or raise the limit of saturation"
         )
     if check.left_out:
         findings.notes.append(

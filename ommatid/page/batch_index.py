@@ -117,24 +117,15 @@ def _entry(folder: Path, failure: str) -> BatchEntry:
         return BatchEntry(folder.name, failure=failure)
     try:
         check_folder(folder)
-        report, area = run_json.read(folder), _sensor_area(folder / "scene.toml")
-        page, picture = (url(folder.name, file) for file in (REPORT, PICTURE))
-        return BatchEntry(folder.name, report, sensor_area=area, page=page, picture=picture)
+        report = run_json.read(folder)
     except InputError as error:
         return BatchEntry(folder.name, failure=str(error))
-
-
-def _sensor_area(path: Path) -> float | None:
-    try:
-        scene = read_scene(path)
-        return optical_terms(scene, derive(scene)).sensor_area
-    except InputError:  # a folder of an earlier version, or of recorded frames
-        return None
-
-
-def url(folder: str, file: str) -> str:
-    """Return the address of a file of a run, relative to the index, from the path of its folder."""
-    return quote(os.fsencode(f"{Path(folder).name}/{file}"))
+    area = None
+    with suppress(InputError):  # a folder of an earlier version, or of recorded frames
+        scene = read_scene(folder / "scene.toml")
+        area = optical_terms(scene, derive(scene)).sensor_area
+    page, picture = (quote(os.fsencode(f"{folder.name}/{file}")) for file in (REPORT, PICTURE))
+    return BatchEntry(folder.name, report, sensor_area=area, page=page, picture=picture)
 
 
 def page(entries: list[BatchEntry], stamp: str, noun: str = "scenes", **content: Any) -> str:

@@ -240,25 +240,24 @@ def _report(path: Path, output: Path | None, progress: Progress) -> ReportOutcom
         return _report_stack(path, path.parent if in_run else output or path.with_suffix(""), progress)
     if output is not None:
         raise InputError(f"{path}: -o is the folder of a stack's results; a folder is reported in place, leave out -o")
-    if (path / STACK).is_file():
-        if (path / RUN).is_file():
-            with occupied(path):
-                _write_page(path)
-            return ReportOutcome((path,), None, _design_warnings(path))
+    alone = (path / STACK).is_file()
+    if alone and not (path / RUN).is_file():
         return _report_stack(path / STACK, path, progress)
-    folders = tuple(sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file()))
+    inside = sorted(run.parent for run in path.glob(f"*/{RUN}") if run.with_name(STACK).is_file())
+    for folder in () if alone else inside:
+        check_inside(folder)
+    folders = (path,) if alone else tuple(inside)
     if not folders:
         raise InputError(f"{path}: expected a stack, or a folder with stack.exr or with folders of runs, got none")
-    for folder in folders:
-        check_inside(folder)
     for number, folder in enumerate(folders):
         with occupied(folder):
             _write_page(folder)
         progress((number + 1) / len(folders))
-    with occupied(path):
-        cached_index(path, dict.fromkeys(folders, ""))
+    if not alone:
+        with occupied(path):
+            cached_index(path, dict.fromkeys(folders, ""))
     warnings = tuple(warning for folder in folders for warning in _design_warnings(folder))
-    return ReportOutcome(folders, path / INDEX, warnings)
+    return ReportOutcome(folders, None if alone else path / INDEX, warnings)
 
 
 def _report_stack(stack: Path, folder: Path, progress: Progress) -> ReportOutcome:

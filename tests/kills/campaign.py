@@ -48,6 +48,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "sweep": ((*SWEEP, "--workers", "1"),),
     "shares of --job": tuple((*BATCH, "--workers", "1", "--job", f"{share}/2") for share in (1, 2)),
     "frames": (FRAMES,),
+    "frames of two processes": ((*FRAMES, "--workers", "2"),),
     "stack and model": (("reconstruct", f"{INPUTS}/a.exr", f"{INPUTS}/{MODEL}", "-o", f"{OUT}/a"),),
 }
 

@@ -53,11 +53,12 @@ def with_unseen(system: FrameSystem, seen: Preconditioner) -> Preconditioner:
         return seen
     if isinstance(system.prior, float):
         return WithUnseen(seen, ((unseen.astype(np.float64), np.full(system.shape, 1 / system.prior)),))
-    return WithUnseen(seen, tuple(_octaves(unseen, 1 / system.prior)))
+    return WithUnseen(seen, tuple(_octaves(unseen, 1 / np.asarray(system.prior))))
 
 
 def _octaves(unseen: BoolArray, spectrum: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    down, across = (np.arange(size) / (2 * size) for size in unseen.shape)
+    rows, columns = unseen.shape
+    down, across = np.linspace(0, 0.5, rows, endpoint=False), np.linspace(0, 0.5, columns, endpoint=False)
     frequency = np.hypot(down[:, None], across)
     distance = ndimage.distance_transform_edt(unseen) if not unseen.all() else np.full(unseen.shape, np.inf)
     octaves: list[tuple[FloatArray, FloatArray]] = []

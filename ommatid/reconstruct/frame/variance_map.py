@@ -241,7 +241,8 @@ class Edges:
     def ratios(self, level: float, ratios: tuple[float, ...]) -> FloatArray:
         """Return the ratios of the three maps for all weights times `level`: (3, rows, columns)."""
         small = self._corners.maps(level, ratios) / self._interior.variances(level, ratios)[:, None, None]
-        small /= self._product(self.near, level, ratios)
+        strips = self._product(self.near, level, ratios)
+        small = np.divide(small, strips, out=np.ones_like(small), where=strips > 0)  # 0 of noise where none counts
         return self._product(self.shape, level, ratios) * _in_corners(small, self.shape)
 
     def _product(self, shape: tuple[int, int], level: float, ratios: tuple[float, ...]) -> FloatArray:

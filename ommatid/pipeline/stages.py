@@ -104,11 +104,12 @@ class SceneWork:
 def write_figures(folder: Path, figures: FigureFiles) -> None:
     """Write the figures of a finished run in these files. Raises InputError or MachineError."""
     from ommatid.analysis.depth_error import PICTURE, draw
+    from ommatid.reconstruct.output import run_json
     from ommatid.reconstruct.output.overview import write_overview
     from ommatid.reconstruct.output.result_files import ESTIMATE, read_estimate
+    from ommatid.scenes import stack as stack_file
 
-    results = StageResults.read(folder)
-    stack, report = results.stack, results.report
+    report, stack = run_json.read(folder), stack_file.read(folder / "stack.exr")
     write_overview(folder, stack, read_estimate(folder / ESTIMATE).channels, report, figures)
     if report.depth:
         draw(folder / PICTURE, stack.camera, report.depth, files=figures)
